@@ -17,7 +17,7 @@ from autopilot_files import Drive, write_dataflash, write_ulog
 from pymavlink.DFReader import DFReader_binary
 from pyulog import ULog
 
-from tcpipe.formats.logs.autopilot_records import read_records
+from tcpipe.formats.logs.autopilot_log import read_records
 from tcpipe.formats.logs.log_file import find_autopilot
 
 MOST_SHARE = {"ulog": 0.8, "dataflash": 0.1}

@@ -13,8 +13,7 @@ from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation.scenarios import find_scenario
 from tcpipe.simulation.site_files import write_rasters
 from tcpipe.store import Store, open_store
-from tcpipe.tables.arrays import make_lines
-from tcpipe.tables.columns import to_floats
+from tcpipe.tables.columns import make_lines, to_floats
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

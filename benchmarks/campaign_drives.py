@@ -36,9 +36,8 @@ from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_sm
 from tcpipe.simulation.sensors import Noise, Reading, Sensors, record
 from tcpipe.simulation.world import MUD, PAVED, UNPAVED, Band, Ellipse, Hill, Site, World, draw_waves
 from tcpipe.stages.read import read_run
-from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import Quality, flag_name
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import to_floats, to_integers, to_numbers
 from tcpipe.tables.findings import WITNESSES_OF_LABEL, Finding
 from tcpipe.tables.levels import LabelledSegments, Streams, Track
 

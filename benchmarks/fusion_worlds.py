@@ -40,9 +40,8 @@ from tcpipe.errors import TcpipeError
 from tcpipe.formats.finding_lines import format_finding
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
-from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import to_floats, to_integers, to_numbers
 from tcpipe.tables.findings import WITNESSES_OF_LABEL, Finding, sort_findings
 from tcpipe.tables.levels import STREAMS, LabelledSegments, Sensor, Streams, Track
 

@@ -26,8 +26,7 @@ from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.documents import BLOBS, INDEX, State, make_key
 from tcpipe.formats.integrity import compute_checksum
 from tcpipe.formats.logs.writing import write_mcap
-from tcpipe.formats.runs import LogOrigin, Run
-from tcpipe.formats.store_records import find_lineage
+from tcpipe.formats.runs import LogOrigin, Run, find_lineage
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.calls import INGEST, record_call
 from tcpipe.pipeline.ingest import CallOptions, ingest
@@ -43,7 +42,7 @@ from wheel_drives import wheel_drive
 DAY_NS = 86_400 * 10**9
 FIRST_NS = 10**18
 STEM = "drive_"
-SHARED = ("findings", "sensors", "topics", "notes", "read_report", "distance_by_reason_m", "physics")
+SHARED = ("findings", "sensors", "topics", "notes", "distance_by_reason_m", "physics")
 """What a synthetic run has of the drive that was ingested."""
 LIMITS = {"status": (1.2, None), "ingest": (None, None), "new": (2.2, 300), "build-dataset": (2.5, 300)}
 """CPU time [s] and memory [MB] of a command with 10,000 runs, where the index is there."""

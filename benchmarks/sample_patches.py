@@ -26,8 +26,7 @@ from tcpipe.compiled import compile_kernel
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.geotiff import write_geotiff
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import make_paper_layers
+from tcpipe.terrain.layers import PAPER_CLASSES, ClassTable, make_paper_layers
 from tcpipe.terrain.sampling import make_patch_frames, map_px_from_patch, sample_patches
 from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import TilePool, group_by_tile

@@ -24,8 +24,7 @@ from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.read import read_run
-from tcpipe.tables.arrays import to_numbers
-from tcpipe.tables.columns import to_floats
+from tcpipe.tables.columns import to_floats, to_numbers
 
 HEAD = ("wheels", "driven", "steady", "labelled", "with power", "undoubted", "sampled")
 

@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import cast
 
 import click
+from contracts import DOCUMENTS, json_output_types, make_contracts
 from stable import FILE, describe_stable, find_lost_names
 
 from tcpipe import __version__
 from tcpipe.cli import cli
-from tcpipe.cli.site_commands import json_output_types
-from tcpipe.formats.contracts import DOCUMENTS, make_contracts
 from tcpipe.formats.finding_lines import format_number
 from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles
 from tcpipe.planning.path_cost import PATH_SEGMENTS
@@ -352,6 +351,6 @@ if __name__ == "__main__":
         (REFERENCE / name).write_text(text, encoding="utf-8")
     for path in SCHEMAS.glob("*.json"):
         path.unlink()
-    for name, text in make_contracts(json_output_types()).items():
+    for name, text in make_contracts().items():
         (SCHEMAS / name).write_text(text, encoding="utf-8")
     sys.stdout.write(f"wrote {REFERENCE} and {SCHEMAS}\n")

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import click
+from contracts import DOCUMENTS, json_output_types, make_contracts
 
 import tcpipe
 from tcpipe.cli import cli
-from tcpipe.cli.site_commands import json_output_types
 from tcpipe.dataset import Dataset, Split
-from tcpipe.formats.contracts import DOCUMENTS, make_contracts
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.learning.evaluation_files import EvaluationResult
 from tcpipe.learning.training import TrainResult
@@ -40,7 +39,7 @@ _LOST = (
 
 def describe_stable() -> dict[str, list[str]]:
     """Return what is stable, a line for each name."""
-    schemas = {name: json.loads(text) for name, text in make_contracts(json_output_types()).items()}
+    schemas = {name: json.loads(text) for name, text in make_contracts().items()}
     keys = {
         name: sorted({*_iterate_keys(schemas[f"{name}.schema.json"], f"{name}.schema.json", schemas)})
         for name in ("recipe", *DOCUMENTS, *json_output_types())

@@ -12,15 +12,14 @@
 from __future__ import annotations
 
 import re
+from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.atomic import check_local_output, make_unique_name
-from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
-from tcpipe.formats.cache import fetch_cached
+from tcpipe.formats.atomic import check_input_path, check_local_output, make_unique_name
 from tcpipe.formats.documents import (
     BLOBS,
     KINDS,
@@ -34,11 +33,10 @@ from tcpipe.formats.documents import (
 )
 from tcpipe.formats.documents import parse_name as parse_document_name
 from tcpipe.formats.integrity import CHECKSUMS, compute_checksums
-from tcpipe.formats.json_files import parse_typed_json, to_compact_json
 from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.place import Place, open_place
-from tcpipe.formats.runs import Run, RunFacts, strip_repeated
-from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.place import Place, find_changed_files, open_place
+from tcpipe.formats.published_outputs import FetchedShards, fetch_files
+from tcpipe.formats.runs import Run, RunFacts, StoredMap, strip_repeated
 from tcpipe.formats.stored_runs import StoredRun, convert_run_errors
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
@@ -130,39 +128,21 @@ class Store:
             yield directory / f"{name}.zarr", put
 
     def prove(self, runs: Sequence[StoredRun]) -> dict[str, str]:
-        """Compare segments and tracks with what the manifests have of them; return by run what is wrong.
+        """Compare segments and tracks on disk with what the manifests have of them; return by run what is wrong.
 
-        On disk, files that are as they were when they were compared before are not read again; from a bucket each file is verified when
-        it is fetched.
+        From a bucket each file is verified when it is fetched.
         """
         if self.place.path is None:
             return {}
-        damaged, new = dict[str, str](), dict[str, list[tuple[int, int]]]()
-        remembered = fetch_cached(
-            f"verified files of {self.place.path.resolve()}", lambda path: path.write_bytes(b"{}")
-        )
-        verified = dict[str, list[tuple[int, int]]]()
-        with suppress(StoreError, OSError):
-            verified = parse_typed_json(remembered.read_bytes(), dict[str, list[tuple[int, int]]], remembered)
-        for run in runs:
-            try:
-                paths = [
-                    self.place.path / BLOBS / run.facts.blob / name for name in ("segments.parquet", "track.parquet")
-                ]
-                with suppress(OSError):
-                    seen = [(status.st_size, status.st_mtime_ns) for status in map(Path.stat, paths)]
-                    if verified.get(run.facts.blob) == seen:
-                        continue
-                    new[run.facts.blob] = seen
-                for path in paths:
-                    run.file(path.name)
-            except StoreError as error:
-                damaged[run.run_id] = error.problems[0]
-                new.pop(run.facts.blob, None)
-        if new:
-            with suppress(OSError):
-                remembered.write_bytes(to_compact_json({**verified, **new}))
-        return damaged
+        checksums = [
+            {f"{run.facts.blob}/{name}": run.facts.tables[name] for name in ("segments.parquet", "track.parquet")}
+            for run in runs
+        ]
+        every, blobs = dict(ChainMap(*checksums)), self.place.below(BLOBS)
+        if not find_changed_files(blobs, every, every):
+            return {}
+        wrong = [find_changed_files(blobs, files, files) for files in checksums]
+        return {run.run_id: lines[0] for run, lines in zip(runs, wrong, strict=True) if lines}
 
 
 def counts(row: RunFacts, state: State) -> bool:
@@ -219,3 +199,37 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     if create:
         store.place.clear()
     return store
+
+
+def is_path(name: Path | str) -> bool:
+    """Return whether a name is a URL, or that of a file or directory; any other is looked up as a run."""
+    if is_url(name):
+        return True
+    with suppress(UsageError):
+        check_input_path(name)
+        return True
+    return False
+
+
+def find_named_runs(name: Path | str, store: Path | str) -> list[StoredRun]:
+    """Return the runs called RUN, under each recipe, or RUN/RECIPE; `UsageError` if the store has none."""
+    if str(name) != str(store) and not is_store(store):
+        raise UsageError(
+            f"{name}: there is no such file or directory; if it is a run, name its store with --store: there is none at {store}"
+        )
+    found = open_store(store).find_runs(str(name))
+    if not found:
+        raise UsageError(
+            f"{name}: there is no such file or directory, and no such run in {store}; "
+            f"expected a path, a run or RUN/RECIPE; 'tcpipe inspect {store}' lists the runs"
+        )
+    return found
+
+
+def find_named_run(name: Path | str, store: Path | str) -> StoredRun:
+    """Return the run called RUN or RUN/RECIPE; `UsageError` if the store has none, or several of that name."""
+    found = find_named_runs(name, store)
+    if len(found) > 1:
+        names = ", ".join(run.name for run in found)
+        raise UsageError(f"{name}: was ingested under several recipes; expected one of {names}")
+    return found[0]

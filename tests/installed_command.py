@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+from json_contracts import json_output_types
+
 from tcpipe.cli import main
-from tcpipe.cli.site_commands import json_output_types
 from tcpipe.formats import object_storage
 from tcpipe.formats.json_files import parse_typed, to_plain
 
@@ -86,7 +87,7 @@ def _serve(client: socket.socket) -> None:
 
 
 def _run_here(command: list[str], cwd: Path, env: Mapping[str, str], out: int, err: int) -> int:
-    new = patch.dict(object_storage._patience, clear=True)  # as in a process that has had no answer
+    new = patch.dict(object_storage._has_answered, clear=True)  # as in a process that has had no answer
     with chdir(cwd), patch.dict(os.environ, env, clear=True), new, _standard_files(out, err):
         return _exit_code(command)
 

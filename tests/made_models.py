@@ -18,7 +18,7 @@ from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.model_card import ModelCard, TrainedOn, Training, TrainingRange
 from tcpipe.learning.models import write_model
 from tcpipe.learning.predictor import Inputs
-from tcpipe.terrain.classes import PAPER_CLASSES
+from tcpipe.terrain.layers import PAPER_CLASSES
 
 INPUTS = Inputs(
     channels=("ortho", "terrain", "height"), patch_px=40, planes=("ortho", "terrain", "height"), patch_m=1.0,

@@ -12,10 +12,9 @@ from rasterio import Affine
 
 from tcpipe.formats.maps.geotiff import keep_open
 from tcpipe.formats.maps.layer_building import open_raster
-from tcpipe.tables.arrays import make_lines
+from tcpipe.tables.columns import make_lines
 from tcpipe.tables.levels import LABELLED_SEGMENTS
-from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import PAPER_LAYERS, find_no_data_value, make_paper_layers
+from tcpipe.terrain.layers import PAPER_CLASSES, PAPER_LAYERS, ClassTable, find_no_data_value, make_paper_layers
 from tcpipe.terrain.resampling import iterate_levels, make_overview_grid
 from tcpipe.terrain.target_grid import MapGrid
 

@@ -64,7 +64,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
                 "messages",
                 "power_fields",
                 "roles",
-                "wire_cursors",
+                "wire_types",
             )
         ),
         ("tests/unit/logs",),

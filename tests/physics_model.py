@@ -10,8 +10,7 @@ from tcpipe.dataset.tensor import TensorLayout
 from tcpipe.learning.model_card import TrainingRange
 from tcpipe.learning.predictor import Prediction
 from tcpipe.tables.facts import PhysicsFit
-from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import PAPER_LAYERS, make_paper_layers
+from tcpipe.terrain.layers import PAPER_CLASSES, PAPER_LAYERS, ClassTable, make_paper_layers
 
 CLASSES_SEEN = (4, 5, 6, 7)
 

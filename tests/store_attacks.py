@@ -19,8 +19,7 @@ from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import BLOBS, State, make_key, parse_name, read_record
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.runs import Run, RunFacts
-from tcpipe.formats.store_records import Output, Process, StoredMap
+from tcpipe.formats.runs import Output, Process, Run, RunFacts, StoredMap
 from tcpipe.formats.stored_runs import STREAMS
 from tcpipe.pipeline import calls, ingest_run, prune
 from tcpipe.pipeline.calls import ADD_MAP, BUILD, list_open_calls, record_call

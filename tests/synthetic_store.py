@@ -22,8 +22,8 @@ from tcpipe.formats.stored_runs import write_streams
 from tcpipe.pipeline.ingest_run import describe_recording, put_run, tag_log, write_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
-from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.bits import DropReason
+from tcpipe.tables.columns import make_lines
 from tcpipe.tables.facts import FuseFacts, NoiseFacts, PowerSign, StageFacts, StretchFacts
 from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import (
@@ -42,7 +42,7 @@ from tcpipe.tables.levels import (
     Track,
     TrackInfo,
 )
-from tcpipe.terrain.classes import PAPER_SCHEME
+from tcpipe.terrain.layers import PAPER_SCHEME
 
 STANDING_WATT = 90.0
 WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=40.0)

@@ -160,7 +160,7 @@ def _print_map(found: InspectedMap) -> None:
 
 def _print_dataset(found: InspectedDataset) -> None:
     from tcpipe.formats.dataset_card import group_dataset_findings
-    from tcpipe.formats.finding_lines import list_mixed_groups, list_verdict
+    from tcpipe.formats.finding_lines import list_groups, list_verdict
 
     print_line(
         f"{found.path}: dataset {found.name}, {found.samples} samples of {', '.join(found.robots)}, "
@@ -181,7 +181,7 @@ def _print_dataset(found: InspectedDataset) -> None:
     )
     for line in list_verdict(found.verdict):
         print_line(f"verdict: {line}")
-    for line in list_mixed_groups(group_dataset_findings(found.findings, found.findings_by_run, found.findings_by_map)):
+    for line in list_groups(group_dataset_findings(found.findings, found.findings_by_run, found.findings_by_map)):
         print_line(line)
 
 

@@ -169,8 +169,8 @@ def _print_findings(summary: IngestSummary) -> None:
     from tcpipe.formats.finding_lines import format_groups, group_findings
 
     made = [result.run for result in summary.results if result.run and result.status != "unchanged"]
-    groups = group_findings((run.run_id, run.findings) for run in made)
-    for line in format_groups(groups, len(made), more=f"tcpipe report {summary.store}"):
+    groups = [(group, len(made), "runs") for group in group_findings((run.run_id, run.findings) for run in made)]
+    for line in format_groups(groups, more=f"tcpipe report {summary.store}"):
         print_line(line)
 
 
@@ -326,8 +326,8 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
 
     This applies to one problem of one content: tcpipe reports other problems, and other content.
     """
-    from tcpipe.formats.finding_lines import describe_title
     from tcpipe.pipeline.problems import acknowledge as run
+    from tcpipe.tables.findings import find_entry
 
     result = run(names, store=store)
     if as_json:
@@ -335,7 +335,7 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
         return 0
     for word, problems in (("acknowledged", result.acknowledged), ("acknowledged before", result.before)):
         for problem in problems:
-            print_line(f"{word}: {problem.name}: {describe_title(problem.finding)} [{problem.finding.code}]")
+            print_line(f"{word}: {problem.name}: {find_entry(problem.finding.code).title} [{problem.finding.code}]")
     if not result.acknowledged:
         print_line("nothing to do: these problems are already acknowledged")
     return 0

@@ -300,7 +300,7 @@ def add_path_or_run(name: str, metavar: str, *, required: bool) -> Option:
         @click.pass_context
         @wraps(run)
         def command(context: click.Context, /, *, store: str, **values: Any) -> Any:
-            from tcpipe.pipeline.named_runs import is_path
+            from tcpipe.store import is_path
 
             given = values[name]
             if given and is_path(given) and context.get_parameter_source("store") is ParameterSource.COMMANDLINE:

@@ -183,27 +183,20 @@ def _format_megabytes(size_bytes: float) -> str:
     return f"{size_bytes / 1e6:.1f}"
 
 
-_ONE_EVENT_S = 60.0
-"""Warnings of the same text within this time tell of one event."""
-
-
 class _Lines(logging.Handler):
-    """Sends messages of the pipeline to the progress display; what several workers say of one event is one line."""
+    """Sends messages of the pipeline to the progress display."""
 
     def __init__(self, shown: Progress) -> None:
         super().__init__()
         self._shown = shown
-        self._warned = dict[str, float]()
 
     def emit(self, record: logging.LogRecord) -> None:
-        text = record.getMessage()
         if step := step_of(record):
             self._shown.step(step)
         elif record.levelno >= logging.ERROR:
-            self._shown.problem(text)
-        elif record.levelno < logging.WARNING or record.created - self._warned.get(text, 0.0) > _ONE_EVENT_S:
-            self._warned[text] = record.created
-            self._shown.line(text)
+            self._shown.problem(record.getMessage())
+        else:
+            self._shown.line(record.getMessage())
 
 
 @contextmanager

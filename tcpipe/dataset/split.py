@@ -17,7 +17,6 @@ from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
 from tcpipe.dataset.energies import ENERGIES, Energy, find_energy, name_common_std
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
 from tcpipe.errors import DatasetError, list_first
-from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     find_places_in_files,
@@ -28,6 +27,7 @@ from tcpipe.formats.dataset_files import (
     read_samples,
     sample_columns,
 )
+from tcpipe.formats.published_outputs import fetch_directory_by_range
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.levels import LABELS

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.integrity import Checksum, compute_checksum
-from tcpipe.logs.field_mapping import STAMP_UNITS, parse_stamps_ns
-from tcpipe.recipe.checking import parse_utc_ns
+from tcpipe.formats.logs.table_stamps import read_clock
+from tcpipe.logs.field_mapping import STAMP_UNITS
 from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -156,37 +156,20 @@ def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
 
 
 def _parse_stamps(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
-    """Return stamps [ns since 1970, UTC], null for a row without a stamp."""
-    if column.dtype.is_temporal() and column.dtype not in {pl.Time, pl.Duration}:
-        return column.cast(pl.Datetime("ns", getattr(column.dtype, "time_zone", None))).cast(pl.Int64)
-    if column.dtype.is_numeric():
-        return _convert_numeric_stamps(path, column, unit)
-    if column.dtype != pl.String:
-        raise DatasetError(f"{path}: {column.name} is {column.dtype}; expected stamps: numbers, or text in ISO 8601")
-    return pl.Series([_parse_iso_stamp(path, column.name, text) for text in column], dtype=pl.Int64)
-
-
-def _parse_iso_stamp(path: Path, name: str, text: str | None) -> int | None:
-    if text is None:
-        return None
-    try:
-        return parse_utc_ns(text.strip())
-    except ValueError:
-        raise DatasetError(f"{path}: {name} is {text!r}; expected ISO 8601, as 2025-10-14T11:41:00Z") from None
-
-
-def _convert_numeric_stamps(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
-    """Return stamps that are numbers [ns], in the unit that is asked for, the one at the end of the name, or the one of their size."""
-    ending = column.name.lower().rsplit("_", 1)[-1]
-    numbers = column if column.dtype.is_integer() else column.set(~column.is_finite(), None)
-    stamps = parse_stamps_ns(
-        numbers.drop_nulls().to_numpy(), ending if unit == "auto" and ending in STAMP_UNITS else unit
-    )
-    if isinstance(stamps, str):
-        raise DatasetError(f"{path}: {column.name}: {stamps} ({format_recipe_key('covariates.time_unit')})")
-    made = np.zeros(len(numbers), np.int64)
-    made[numbers.is_not_null().to_numpy()] = stamps
-    return pl.Series(made).set(numbers.is_null(), None)
+    """Return stamps [ns since 1970, UTC], null for a row without a stamp; times without a zone are UTC, dates their midnight."""
+    if not column.count():
+        return column.cast(pl.Int64)
+    if column.dtype == pl.String:
+        column = column.str.replace(r"^\s*(\d{4}-\d\d-\d\d)\s*$", "${1}T00:00:00")
+    clock = read_clock(column, unit=unit)
+    if isinstance(clock, str):
+        raise DatasetError(f"{path}: {column.name}: {clock}")
+    if clock.unit or clock.kind == "day":
+        key, units = format_recipe_key("covariates.time_unit"), ", ".join(STAMP_UNITS)
+        raise DatasetError(
+            f"{path}: {column.name}: its stamps do not count from 1970; set their unit, one of {units} ({key})"
+        )
+    return clock.ns
 
 
 def _parse_values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], list[Finding]]:

@@ -27,17 +27,22 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
-from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
-from tcpipe.formats.file_checks import find_changed_files, prove_files
 from tcpipe.formats.integrity import verify_document
 from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_table, write_parquet_bytes
-from tcpipe.formats.place import Place
-from tcpipe.formats.published_outputs import REPORT_PATCHES
-from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
-from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
+from tcpipe.formats.place import REPORT, Place, find_changed_files, prove_files
+from tcpipe.formats.published_outputs import REPORT_PATCHES, FetchedShards
+from tcpipe.formats.zarr_arrays import (
+    DESCRIPTION,
+    Compression,
+    ShardedArray,
+    add_array,
+    consolidate_metadata,
+    create_group,
+    open_sharded,
+)
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.levels import DATA_MODEL_VERSION, describe_other_data_model
 from tcpipe.terrain.layers import Layer, find_no_data_value, sort_layers
@@ -52,7 +57,6 @@ HUB_CARD = "README.md"
 SAMPLES = "samples.parquet"
 PATCHES = "patches.zarr"
 SHARDS = "data"
-REPORT = "report.html"
 OVERVIEW = "overview.png"
 RELIEF = "relief.png"
 CLASSES = "classes.png"
@@ -289,15 +293,6 @@ def read_intact_card(directory: Path) -> DatasetCard:
     with _convert_errors():
         prove_files(directory, card.checksums, [SAMPLES, *described])
     return card
-
-
-_DESKTOP_FILES = (".DS_Store", ".directory", "Thumbs.db", "desktop.ini")
-_STATISTICS = ".aux.xml"
-
-
-def is_desktop_file(name: str) -> bool:
-    """Return whether a file is one that file managers leave in folders, or GDAL and QGIS beside rasters."""
-    return name.rpartition("/")[2] in _DESKTOP_FILES or name.endswith(_STATISTICS)
 
 
 def find_foreign_files(directory: Path, checksums: Collection[str]) -> list[str]:

@@ -18,27 +18,23 @@ Rules (ADR-36):
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import logging
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, cast, get_args
 
 import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import StoreError
-from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.integrity import compute_short_digest
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json, to_json
 from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
-from tcpipe.formats.runs import RunFacts
-from tcpipe.formats.store_records import Call, Failure, LogSnapshot, Output, Problem, StoredMap, Tags, find_lineage
+from tcpipe.formats.runs import Call, Failure, LogSnapshot, Output, Problem, RunFacts, StoredMap, Tags, find_lineage
 from tcpipe.tables.findings import Subject, make_finding
 
 logger = logging.getLogger("tcpipe")
@@ -58,8 +54,6 @@ _UNREAD = 16
 _UNREAD_SHARE = 50
 """The index is written again when more than 16 documents, and one for each 50 in it, were not in it."""
 
-_MANY = 1000
-"""Number of records read at once above which they are excluded from later garbage collections."""
 _SEAL = b"sha256"
 """Key of the metadata of the index."""
 
@@ -250,16 +244,7 @@ def scan(place: Place) -> State:
     if where not in _DECODED:
         _DECODED.clear()
         _DECODED[where] = {}
-    decoded, has_collector = _DECODED[where], gc.isenabled()
-    before = len(decoded)
-    gc.disable()  # the records have no cycles: to search ten thousand of them again and again takes as long as to read them
-    try:
-        return _scan(place, decoded)
-    finally:
-        if has_collector:
-            gc.enable()
-        if len(decoded) - before > _MANY:
-            gc.freeze()
+    return _scan(place, _DECODED[where])
 
 
 def _scan(place: Place, decoded: dict[str, Record]) -> State:
@@ -328,14 +313,10 @@ def _read_document(place: Place, name: Name) -> bytes | None:
 
 
 def _read_index(place: Place) -> dict[str, bytes]:
-    """Return what is cached of documents by name: in the store, and by this machine where it may not write there."""
-    indexed, own = dict[str, bytes](), f"index of {place.where()}"
+    """Return what the index has of documents by name."""
     with suppress(StoreError):
-        indexed |= _parse_index(place.read(INDEX) or b"")
-    if is_cached(own):
-        with suppress(StoreError, OSError):
-            indexed |= _parse_index(fetch_cached(own, Path.touch).read_bytes())
-    return indexed
+        return _parse_index(place.read(INDEX) or b"")
+    return {}
 
 
 def _parse_index(data: bytes) -> dict[str, bytes]:
@@ -350,12 +331,8 @@ def _parse_index(data: bytes) -> dict[str, bytes]:
 def _write_index(place: Place, rows: Mapping[str, bytes]) -> None:
     columns = [pa.array([*rows], pa.string()), pa.array([*rows.values()], pa.binary())]
     table = pa.Table.from_arrays(columns, ["name", "facts"]).replace_schema_metadata({_SEAL: _seal(rows)})
-    data = write_parquet_bytes(table)
-    try:
-        place.put(INDEX, data)
-    except StoreError:  # a reader that may not write here keeps it in its own cache
-        with suppress(StoreError, OSError):
-            fetch_cached(f"index of {place.where()}", Path.touch).write_bytes(data)
+    with suppress(StoreError):  # a reader may not write here
+        place.put(INDEX, write_parquet_bytes(table))
 
 
 def _seal(rows: Mapping[str, bytes]) -> bytes:

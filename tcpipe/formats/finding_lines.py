@@ -20,13 +20,12 @@ from tcpipe.tables.findings import (
     GRADES,
     WITNESSES_OF_LABEL,
     Affected,
-    Entry,
     Finding,
     Remedy,
     Severity,
     Verdict,
+    find_entry,
     rank_severity,
-    read_catalogue,
     sort_findings,
 )
 
@@ -71,9 +70,7 @@ def format_number(name: str, value: float) -> str:
 
 def describe_finding(finding: Finding) -> str:
     """Return what was observed, in one line without its remedy and code."""
-    entry = read_catalogue().get(finding.code)
-    if entry is None:  # made by another version
-        return f"{finding.subject.name}: {finding.code.replace('-', ' ')}"
+    entry = find_entry(finding.code)
     values = {name: format_number(name, number) for name, number in finding.numbers.items()}
     if finding.span_s is not None:
         begin_s, end_s = finding.span_s
@@ -89,15 +86,9 @@ def describe_finding(finding: Finding) -> str:
     return f"{line} ({', '.join(details)})" if details else line
 
 
-def describe_title(finding: Finding) -> str:
-    """Return what its code means, in a few words."""
-    entry = read_catalogue().get(finding.code)
-    return entry.title if entry else finding.code.replace("-", " ")
-
-
 def describe_remedy(finding: Finding, remedy: Remedy) -> str:
     """Return what a remedy does and the keys or the command that do it, in one line; of arrays of tables only that they follow."""
-    purpose = _find_purpose(finding, remedy)
+    purpose = _find_purpose(finding.code, remedy)
     what = [f"'{remedy.command}'"] if remedy.command else []
     what += (
         ["the recipe below"]
@@ -109,9 +100,8 @@ def describe_remedy(finding: Finding, remedy: Remedy) -> str:
     return f"{purpose}: {' and '.join(what)}" if what else purpose
 
 
-def _find_purpose(finding: Finding, remedy: Remedy) -> str:
-    entry = read_catalogue().get(finding.code)
-    return (entry.remedies.get(remedy.name) if entry else None) or remedy.name.replace("_", " ")
+def _find_purpose(code: str, remedy: Remedy) -> str:
+    return find_entry(code).remedies.get(remedy.name) or remedy.name.replace("_", " ")
 
 
 def list_remedies(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
@@ -120,10 +110,10 @@ def list_remedies(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
     for remedy in chain.from_iterable(finding.remedies for finding in findings):
         if remedy not in remedies:
             remedies.append(remedy)
+    code = findings[0].code
     if remedies and len(remedies) <= MOST_LINES:
-        return [(_find_purpose(findings[0], remedy), _list_changes(remedy)) for remedy in remedies]
-    entry = read_catalogue().get(findings[0].code)
-    return [(entry.advice, [])] if entry and entry.advice else []
+        return [(_find_purpose(code, remedy), _list_changes(remedy)) for remedy in remedies]
+    return [(advice, [])] if (advice := find_entry(code).advice) else []
 
 
 def _list_changes(remedy: Remedy) -> list[str]:
@@ -133,9 +123,8 @@ def _list_changes(remedy: Remedy) -> list[str]:
 
 def format_finding(finding: Finding) -> str:
     """Return a finding as one line: what was observed, its remedies or the catalogue's advice, and its code."""
-    entry = read_catalogue().get(finding.code)
-    advice = entry.advice if entry else ""
-    remedies = ". ".join(describe_remedy(finding, remedy) for remedy in finding.remedies) or advice
+    remedies = ". ".join(describe_remedy(finding, remedy) for remedy in finding.remedies)
+    remedies = remedies or find_entry(finding.code).advice
     return f"{describe_finding(finding)}{f'. {remedies}' if remedies else ''}".rstrip(".") + f" [{finding.code}]"
 
 
@@ -157,29 +146,16 @@ def _build_recipe_fragment(remedy: Remedy) -> RecipeFragment:
 
 def format_findings(findings: Iterable[Finding], *, most: int = MOST_LINES, more: str = "") -> list[str]:
     """Return at most ``most`` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
-    printed = _sort_printed(findings)
-    problems = [finding for finding in printed if finding.severity != "note"]
-    return list_findings(problems[:most]) + _count_rest(len(problems) - most, len(printed) - len(problems), more)
-
-
-def _sort_printed(findings: Iterable[Finding]) -> list[Finding]:
-    """Return the findings, the worst first, except those on witnesses, which are lines of the verdict."""
-    return [finding for finding in sort_findings(findings) if finding.code != WITNESSES_OF_LABEL]
+    return format_groups(_make_single_groups(findings), most=most, more=more)
 
 
 def list_findings(findings: Iterable[Finding]) -> list[str]:
     """Return every finding as a line, the worst first, notes too, with the recipe that fits in no line below it."""
-    lines = []
-    for finding in _sort_printed(findings):
-        lines += [f"{finding.severity}: {format_finding(finding)}"]
-        lines += [f"    {line}" for line in format_remedy_blocks([finding])]
-    return lines
+    return list_groups(_make_single_groups(findings))
 
 
-def _count_rest(findings: int, notes: int, more: str) -> list[str]:
-    counted = ((max(findings, 0), "more finding"), (notes, "note"))
-    rest = " and ".join(f"{count} {what}{'' if count == 1 else 's'}" for count, what in counted if count)
-    return [f"and {rest}{f': {more}' if more else ''}"] if rest else []
+def _make_single_groups(findings: Iterable[Finding]) -> list[tuple[FindingGroup[str], int | None, str]]:
+    return [(FindingGroup(each.code, {each.subject.name: (each,)}), None, "") for each in sort_findings(findings)]
 
 
 def format_verdict(verdict: Verdict, quantities: Sequence[Affected] = AFFECTED) -> str:
@@ -241,8 +217,7 @@ def format_loss(loss: StoreLoss) -> str:
 
 def advise_on_loss(reason: str) -> str:
     """Return the remedy for a reason of the distance breakdown; "" without one."""
-    entry = read_catalogue().get(make_loss_code(reason))
-    return entry.advice if entry else ""
+    return find_entry(make_loss_code(reason)).advice
 
 
 @dataclass(frozen=True)
@@ -271,11 +246,9 @@ def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[Find
         for finding in each:
             findings_by_subject = found.setdefault(finding.code, {})
             findings_by_subject[key] = (*findings_by_subject.get(key, ()), finding)
-    catalogue = read_catalogue()
 
     def rank(group: FindingGroup[K]) -> tuple[int, int, int]:
-        entry = catalogue.get(group.code)
-        return rank_severity(group.severity), -len(entry.affects if entry else ()), -len(group.of)
+        return rank_severity(group.severity), -len(find_entry(group.code).affects), -len(group.of)
 
     return sorted((FindingGroup(code, grouped) for code, grouped in found.items()), key=rank)
 
@@ -303,22 +276,22 @@ def describe_group(group: FindingGroup[K], total: int | None, what: str) -> str:
 
 def _describe_range(findings: Sequence[Finding]) -> str:
     subjects = ", ".join(sorted({finding.subject.name for finding in findings})[:_MOST_SUBJECTS])
-    return "; ".join(filter(None, (subjects, _format_range(read_catalogue().get(findings[0].code), findings))))
+    return "; ".join(filter(None, (subjects, _format_range(findings))))
 
 
 def format_count(
     code: str, count: int, total: int | None, what: str = "runs", details: str = "", *, remedy: str = ""
 ) -> str:
     """Return as one line that ``count`` of ``total`` runs have a finding."""
-    entry = read_catalogue().get(code)
-    title = entry.title if entry else code.replace("-", " ")
     head = "" if total is None else f"{count} of {total} {what}: "
-    return f"{head}{title}{f' ({details})' if details else ''}{f'. {remedy}' if remedy else ''} [{code}]"
+    return (
+        f"{head}{find_entry(code).title}{f' ({details})' if details else ''}{f'. {remedy}' if remedy else ''} [{code}]"
+    )
 
 
-def _format_range(entry: Entry | None, findings: Sequence[Finding]) -> str:
+def _format_range(findings: Sequence[Finding]) -> str:
     """Return the range of the first number that the template names."""
-    fields = Formatter().parse(entry.template) if entry else ()
+    fields = Formatter().parse(find_entry(findings[0].code).template)
     name = next((name for _, name, _, _ in fields if name in findings[0].numbers), None)
     if name is None:
         return ""
@@ -328,33 +301,31 @@ def _format_range(entry: Entry | None, findings: Sequence[Finding]) -> str:
 
 
 def format_groups(
-    groups: Iterable[FindingGroup[K]], total: int | None, what: str = "runs", *, most: int = MOST_LINES, more: str = ""
+    groups: Iterable[tuple[FindingGroup[K], int | None, str]], *, most: int = MOST_LINES, more: str = ""
 ) -> list[str]:
-    """Return at most ``most`` groups as lines, the worst first, then how many others and notes are listed by the command ``more``."""
-    return format_mixed_groups([(group, total, what) for group in groups], most=most, more=more)
+    """Return at most ``most`` groups as lines, each with the arguments of `format_group`, the worst first.
 
-
-def format_mixed_groups(
-    groups: Sequence[tuple[FindingGroup[K], int | None, str]], *, most: int = MOST_LINES, more: str = ""
-) -> list[str]:
-    """Return the same of groups of different things, each with the arguments of `format_group`."""
-    printed = _sort_printed_groups(groups)
+    The last line states how many others and notes are listed by the command ``more``.
+    """
+    printed = _sort_printed(groups)
     problems = [group for group in printed if group[0].severity != "note"]
-    return list_mixed_groups(problems[:most]) + _count_rest(len(problems) - most, len(printed) - len(problems), more)
+    counted = ((max(len(problems) - most, 0), "more finding"), (len(printed) - len(problems), "note"))
+    rest = " and ".join(f"{count} {what}{'' if count == 1 else 's'}" for count, what in counted if count)
+    return list_groups(problems[:most]) + ([f"and {rest}{f': {more}' if more else ''}"] if rest else [])
 
 
-def _sort_printed_groups(
+def _sort_printed(
     groups: Iterable[tuple[FindingGroup[K], int | None, str]],
 ) -> list[tuple[FindingGroup[K], int | None, str]]:
-    """Return what `_sort_printed` does of groups."""
+    """Return the groups, the worst first, except those on witnesses, which are lines of the verdict."""
     printed = (group for group in groups if group[0].code != WITNESSES_OF_LABEL)
     return sorted(printed, key=lambda group: rank_severity(group[0].severity))
 
 
-def list_mixed_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
-    """Return every group as a line, the worst first, notes too."""
+def list_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
+    """Return every group as a line, the worst first, notes too, with the recipe that fits in no line below it."""
     lines = []
-    for group, total, what in _sort_printed_groups(groups):
+    for group, total, what in _sort_printed(groups):
         lines += [f"{group.severity}: {format_group(group, total, what)}"]
         lines += [f"    {line}" for line in format_remedy_blocks(group.findings)]
     return lines

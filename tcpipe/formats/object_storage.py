@@ -7,21 +7,15 @@ The home of obstore. Credentials, region and endpoint come from the environment,
 from __future__ import annotations
 
 import configparser
-import logging
-import math
 import multiprocessing
 import os
 import re
-import threading
-import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import timedelta
 from functools import lru_cache
-from itertools import chain, repeat
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import unquote
@@ -36,9 +30,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 U = TypeVar("U")
 
-logger = logging.getLogger("tcpipe")
-
-_SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY")
+_SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY", "TCPIPE_RETRY_MINUTES")
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[0-9a-f:]+\])(:\d{1,5})?(/[\w./-]*)?", re.IGNORECASE)
 _PIECE_BYTES = 1 << 24
@@ -46,21 +38,12 @@ _PIECE_BYTES = 1 << 24
 _AT_ONCE = 8
 _PERCENT_ENCODED = ("file", "http", "https")
 """Schemes whose names are written with percent signs; object stores' own tools write them as they are."""
-_FIRST_S = 4.0
-"""The first request of a process waits so long for an answer: a user may be watching."""
-_RETRY_MINUTES = 10.0
-"""Later requests wait so long, unless TCPIPE_RETRY_MINUTES gives another time."""
-_PAUSES_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
-"""Before a request is made again; the last one again and again."""
-_TELL_AFTER_S = 1.0
-"""A shorter interruption is not worth a line."""
-_IMPATIENT: dict[str, Any] = {"max_retries": 0}
-_PATIENT: dict[str, Any] = {
-    "max_retries": 4,
-    "retry_timeout": timedelta(seconds=2),
-    "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=1), "base": 2},
-}
-"""What obstore does by itself, for each part of a large file, before the whole request is made again here."""
+_FIRST_S, _FIRST_RETRY_S = 4.0, 1.0
+"""The first request of a process waits so long for an answer, and is repeated for so long: a user may be watching."""
+_RETRY_MINUTES = "10"
+"""Time for which obstore repeats later requests [min], unless TCPIPE_RETRY_MINUTES gives another: a store may restart."""
+_MAX_RETRIES = 10_000
+"""More than fit into that time: the time alone decides."""
 _DENIED = (
     "169.254.169.254", "Account must be specified", "401 Unauthorized", "403 Forbidden", "Missing AccessKeyId", "Missing SecretAccessKey"
 )  # fmt: skip
@@ -77,8 +60,6 @@ _NO_ANSWER = {
 _CODE = re.compile(r"<Code>(\w+)</Code>")
 _STATUS = re.compile(r"\b([45]\d\d) [A-Z][A-Za-z ]*(?=: )")
 _ADDRESS = re.compile(r"https?://(?:[^\s/@]*@)?[^\s/?)]+")
-_TRY_AGAIN = (408, 429)
-"""Answers about the request that may be others a moment later, as all of 500 and more."""
 _REFUSED = {
     "RequestTimeTooSkewed": "the clock of this machine is wrong; set it",
     "SignatureDoesNotMatch": "the secret key does not belong to the access key",
@@ -251,24 +232,8 @@ def _lay_out_stand_ins(
     return laid
 
 
-@dataclass(slots=True)
-class _Patience:
-    """How this process asks a bucket."""
-
-    is_long: bool = field(default_factory=lambda: multiprocessing.parent_process() is not None)
-    """Whether a request without an answer is made again for minutes: there was one before, or to the process that started this one."""
-    has_told: bool = False
-    """Whether it was said that there is no answer."""
-
-    @property
-    def limit_s(self) -> float:
-        """How long a request may wait for an answer."""
-        return _read_retry_s() if self.is_long else _FIRST_S
-
-
-_patience: defaultdict[object, _Patience] = defaultdict(_Patience)
-"""By bucket and environment."""
-_here = threading.local()
+_has_answered: dict[object, bool] = {}
+"""By bucket and environment: whether the last request had an answer. Workers begin with True: their parent had one."""
 
 
 def ask_store(
@@ -280,95 +245,36 @@ def ask_store(
     bucket: str = "",
     query: str = "",
 ) -> T:
-    """Return what a request gives to which an object is ``read`` or ``written``; while there is no answer it is made again.
+    """Return what a request gives to which an object is ``read`` or ``written``.
 
-    The first request of a command fails within 5 s. Later ones, and those of worker processes, are made again for minutes; after one of
-    them has failed, the next ones fail soon, too, until the store answers again. An error is one line; `FileNotFoundError` (no such object)
-    and `AlreadyExistsError` pass.
+    Without an answer the first request of a command fails within 5 s; later ones, and those of worker processes, are repeated for minutes.
+    After one of them has failed, the next ones fail soon, too, until the store answers again. An error is one line; `FileNotFoundError`
+    (no such object) and `AlreadyExistsError` pass.
     """
     from obstore.exceptions import AlreadyExistsError, BaseError  # noqa: PLC0415
 
-    bucket, began, pauses = bucket or split_bucket(url)[0], time.monotonic(), chain(_PAUSES_S, repeat(_PAUSES_S[-1]))
+    bucket = bucket or split_bucket(url)[0]
     settings = tuple(sorted((key, value) for key, value in os.environ.items() if key.upper().startswith(_SETTINGS)))
-    patience = _patience[bucket, query, settings]
-    while True:
-        store: ObjectStore | None = None
-        asked = time.monotonic()
-        try:
-            store = _connect(bucket, query, settings, is_first=not patience.is_long)
-            result = request(store)
-        except (BaseError, OSError, ValueError) as found:
-            if store is not None and _is_unanswered(found):
-                now, pause = time.monotonic(), next(pauses)
-                if now - began + pause + (0.0 if patience.is_long else now - asked) < patience.limit_s:
-                    _tell_no_answer(bucket, patience, found, waited_s=now - began)
-                    _wait(pause)
-                    continue
-                patience.is_long = False  # whatever is asked next
-            passes = isinstance(found, FileNotFoundError | AlreadyExistsError) and error is not LogError
-            code = _CODE.search(str(found))
-            if passes and not (code and code[1] == "NoSuchBucket"):
-                patience.is_long = True
-                raise
-            reason = _describe_store_error(url, found, code and code[1], what)
-            raise error(f"{url}: it cannot be {what} ({reason})") from None
-        patience.is_long, patience.has_told = True, False
-        return result
-
-
-def _is_unanswered(error: Exception) -> bool:
-    """Return whether a request may have an answer a moment later: the connection broke, or the store is busy."""
-    from obstore.exceptions import GenericError  # noqa: PLC0415
-
-    if type(error) is OSError:  # a part of what was asked for
-        return True
-    if not isinstance(error, GenericError) or "LocalFileSystem" in str(error)[:50]:
-        return False
-    status = _STATUS.search(str(error))
-    if status:
-        return int(status[1]) >= 500 or int(status[1]) in _TRY_AGAIN
-    return not any(pattern in str(error) for pattern in (*_DENIED, "InvalidCertificate", "InvalidContentType"))
-
-
-def _tell_no_answer(bucket: str, patience: _Patience, error: Exception, *, waited_s: float) -> None:
-    """Say once that a bucket does not answer, unless it does in a moment."""
-    if patience.is_long and waited_s >= _TELL_AFTER_S and not patience.has_told:
-        patience.has_told = True
-        how = f"trying again for up to {_read_retry_s() / 60:g} min (TCPIPE_RETRY_MINUTES)"
-        logger.warning("%s: %s; %s", bucket, _describe_no_answer(error), how)
-
-
-def _read_retry_s() -> float:
-    given = os.environ.get("TCPIPE_RETRY_MINUTES", str(_RETRY_MINUTES))
+    key = bucket, query, settings
+    is_first = not _has_answered.get(key, multiprocessing.parent_process() is not None)
     try:
-        minutes = float(given)
-    except ValueError:
-        minutes = math.nan
-    if not 0.0 <= minutes < math.inf:
-        raise UsageError(f"TCPIPE_RETRY_MINUTES is {given!r}, expected a number of minutes, such as {_RETRY_MINUTES:g}")
-    return 60.0 * minutes
-
-
-def _wait(seconds: float) -> None:
-    """Wait; where `run_side_by_side` ends meanwhile, this thread ends."""
-    ended: threading.Event | None = getattr(_here, "ended", None)
-    if ended is None:
-        time.sleep(seconds)
-    elif ended.wait(seconds):
-        raise StoreError("interrupted")
+        result = request(_connect(bucket, query, settings, is_first=is_first))
+    except (BaseError, OSError, ValueError) as found:
+        code = _CODE.search(str(found))
+        is_answer = isinstance(found, FileNotFoundError | AlreadyExistsError) and error is not LogError
+        _has_answered[key] = is_answer and not (code and code[1] == "NoSuchBucket")
+        if _has_answered[key]:
+            raise
+        reason = _describe_store_error(url, found, code and code[1], what)
+        raise error(f"{url}: it cannot be {what} ({reason})") from None
+    _has_answered[key] = True
+    return result
 
 
 def run_side_by_side(function: Callable[[T], U], items: Sequence[T]) -> list[U]:
     """Return what a function that asks a store gives for each item; some at once, as each answer takes a while."""
-    if len(items) <= 1:
-        return list(map(function, items))
-    ended = threading.Event()
-    with ThreadPoolExecutor(_AT_ONCE, initializer=lambda: setattr(_here, "ended", ended)) as pool:
-        try:
-            return list(pool.map(function, items))
-        except BaseException:  # also a signal: nobody waits for minutes then
-            ended.set()
-            raise
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        return list(pool.map(function, items) if len(items) > 1 else map(function, items))
 
 
 def _describe_store_error(url: str, error: Exception, code: str | None, what: str) -> str:
@@ -507,11 +413,22 @@ def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], 
     if scheme != "file":  # who names an endpoint without TLS means it
         client = {"allow_http": True, "connect_timeout": timedelta(seconds=3)}
         client |= {"timeout": timedelta(seconds=_FIRST_S)} if is_first else {}
-        options = {"retry_config": _IMPATIENT if is_first else _PATIENT, "client_options": client}
+        limit_s = 60.0 * _read_retry_minutes()
+        limit_s = min(limit_s, _FIRST_RETRY_S) if is_first else limit_s
+        backoff = {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=3), "base": 2}
+        retry = {"max_retries": _MAX_RETRIES, "retry_timeout": timedelta(seconds=limit_s), "backoff": backoff}
+        options = {"retry_config": retry, "client_options": client}
     options |= read_aws_profile() if scheme == "s3" else {}
     if query:  # also where the host is a bucket's: the query stands for the credentials
         return obstore.store.HTTPStore.from_url(f"{container}?{query}", **options)
     return obstore.store.from_url(container, **options)
+
+
+def _read_retry_minutes() -> float:
+    given = os.environ.get("TCPIPE_RETRY_MINUTES", _RETRY_MINUTES)
+    if not re.fullmatch(r"\d{1,5}(\.\d*)?", given):
+        raise ValueError(f"TCPIPE_RETRY_MINUTES is {given!r}, expected a number of minutes, such as {_RETRY_MINUTES}")
+    return float(given)
 
 
 def _iterate_objects(store: ObjectStore, url: str, query: str, wanted: Callable[[str], bool]) -> Iterator[StoredObject]:

@@ -138,16 +138,15 @@ def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None)
         table = file.read_row_groups(groups, columns)
     for at, field in enumerate(table.schema):  # a text that occurs in many rows lies here once so far
         if pa.types.is_dictionary(field.type):
-            size += sum(_count_text_bytes(chunk) for chunk in table.column(at).chunks)
+            size += sum(
+                int(pc.sum(pc.binary_length(chunk.dictionary).cast(pa.int64()).take(chunk.indices)).as_py() or 0)
+                for chunk in table.column(at).chunks
+            )
             if size > most:
                 raise ValueError(f"its texts unfold to more than {most / 1e6:.0f} MB")
             plain = schema.field(field.name)
             table = table.set_column(at, plain, table.column(at).cast(plain.type))
     return table
-
-
-def _count_text_bytes(chunk: pa.DictionaryArray) -> int:
-    return int(pc.sum(pc.binary_length(chunk.dictionary).cast(pa.int64()).take(chunk.indices)).as_py() or 0)
 
 
 def _iterate_column_sizes(

@@ -7,17 +7,29 @@ read: damage is an error, never a number.
 
 from __future__ import annotations
 
+import math
+import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import google_crc32c
+import numcodecs
 import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError
+from tcpipe.formats.json_files import read_json
 
 if TYPE_CHECKING:
     import zarr
+
+    from tcpipe.formats.published_outputs import FetchedShards
 
 Compression = Literal["zstd", "lz4"]
 """zstd is smaller, lz4 two to three times as fast to read."""
@@ -81,3 +93,230 @@ def consolidate_metadata(group: zarr.Group) -> None:
         # zarr's own reservation
         warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
         zarr.consolidate_metadata(group.store)
+
+
+DESCRIPTION = "zarr.json"
+"""What an array or a group is, in its directory."""
+
+_CRC_BYTES = 4
+_ABSENT = 2**64 - 1
+"""Offset of a chunk that is all fill value."""
+
+_BLOSC_SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
+
+
+class _LocalShards:
+    """Shards on this machine, as `FetchedShards` gives those in a bucket."""
+
+    @staticmethod
+    def size(path: Path) -> int:
+        return path.stat().st_size
+
+    @staticmethod
+    def read(path: Path, offset: int, size: int) -> bytes:
+        with path.open("rb", buffering=0) as file:
+            return os.pread(file.fileno(), size, offset)
+
+
+@dataclass(frozen=True, slots=True)
+class ShardedArray:
+    """An array on disk, by its chunks; ``chunk_shape`` divides ``shard_shape``."""
+
+    path: Path
+    shape: tuple[int, ...]
+    chunk_shape: tuple[int, ...]
+    shard_shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fill: float
+    sparse: bool
+    """A shard without a file is all fill value, as in Zarr; otherwise it is damage."""
+    codec: Any
+    """What encodes and decodes a chunk, beneath its checksum."""
+    fetched: FetchedShards | None = None
+    """Where the shards are; None: on this machine."""
+    _indices: dict[tuple[int, ...], NDArray[np.uint64]] = field(default_factory=dict)
+
+    def chunk(self, index: tuple[int, ...], out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Return a chunk, whole even where the array ends inside it: shape ``chunk_shape``; in ``out``, contiguous, where it is given."""
+        shard, place = self._shard_and_place(index)
+        out = np.empty(self.chunk_shape, self.dtype) if out is None else out
+        path = self._shard_path(shard)
+        try:
+            offset, size = self._index(shard)[place].tolist()
+            if offset == _ABSENT:
+                out[...] = self.fill
+            else:
+                _decode(self.codec, self._read(path, offset, size), out)
+        except FileNotFoundError:
+            if not self.sparse:
+                raise StoreError(f"{path}: is missing") from None
+            out[...] = self.fill
+        except (OSError, RuntimeError, ValueError) as error:
+            raise StoreError(f"{path}: chunk {index} is damaged ({error})") from None
+        return out
+
+    def expect(self, indices: Iterable[tuple[int, ...]]) -> None:
+        """Have chunks brought here that are read soon, where they lie elsewhere; what cannot be had is told when it is read."""
+        if self.fetched is None:
+            return
+        wanted = [self._shard_and_place(index) for index in indices]
+        tables, pieces = list[tuple[Path, int, int]](), list[tuple[Path, int, int]]()
+        paths = {shard: self._shard_path(shard) for shard, _ in wanted}
+        for shard in paths.keys() - self._indices.keys():
+            with suppress(FileNotFoundError):
+                tables.append((paths[shard], *self._index_span(self.fetched.size(paths[shard]))))
+        self.fetched.prefetch(tables)
+        for shard, place in wanted:
+            path = paths[shard]
+            with suppress(FileNotFoundError, ValueError):
+                offset, size = self._index(shard)[place].tolist()
+                pieces += [(path, offset, size)] if offset != _ABSENT else []
+        self.fetched.prefetch(pieces)
+
+    def _shard_and_place(self, index: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        per_shard = self.per_shard
+        shard = tuple(i // n for i, n in zip(index, per_shard, strict=True))
+        return shard, tuple(i % n for i, n in zip(index, per_shard, strict=True))
+
+    def window(self, row0: int, row1: int, col0: int, col1: int, lead: tuple[int, ...] = ()) -> NDArray[Any]:
+        """Return rows ``row0:row1`` and columns ``col0:col1`` of the last two axes; `StoreError` as `chunk`.
+
+        ``lead`` are the places on the axes before, along which a chunk has the length 1.
+        """
+        high, wide = self.chunk_shape[-2:]
+        row1, col1 = min(row1, self.shape[-2]), min(col1, self.shape[-1])
+        out = np.empty((row1 - row0, col1 - col0), self.dtype)
+        touched = list(product(range(row0 // high, -(-row1 // high)), range(col0 // wide, -(-col1 // wide))))
+        self.expect((*lead, *tile) for tile in touched)
+        for i, j in touched:
+            top, left = max(i * high, row0), max(j * wide, col0)
+            bottom, right = min((i + 1) * high, row1), min((j + 1) * wide, col1)
+            tile = self.chunk((*lead, i, j)).reshape(high, wide)
+            part = tile[top - i * high : bottom - i * high, left - j * wide : right - j * wide]
+            out[top - row0 : bottom - row0, left - col0 : right - col0] = part
+        return out
+
+    def encoded_shard(self, values: NDArray[Any], *, threads: int = 1) -> bytes:
+        """Return the file of a shard that holds ``values`` from its corner on; what they leave of its last chunks is fill value.
+
+        ``threads`` encode chunks side by side; the bytes do not depend on their number.
+        """
+        values = np.asarray(values, self.dtype)
+        places = list(product(*(range(-(-n // c)) for n, c in zip(values.shape, self.chunk_shape, strict=True))))
+        index, pieces, end = np.full((*self.per_shard, 2), _ABSENT, np.uint64), list[bytes](), 0
+        with ThreadPoolExecutor(threads) as pool:
+            encoded = map if threads == 1 else pool.map
+            for place, data in zip(places, encoded(lambda place: self._encoded(values, place), places), strict=True):
+                index[place] = end, len(data) + _CRC_BYTES
+                pieces += [data, _compute_crc(data)]
+                end += len(data) + _CRC_BYTES
+        table = index.astype("<u8").tobytes()
+        return b"".join((*pieces, table, _compute_crc(table)))
+
+    @staticmethod
+    def shard_name(shard: tuple[int, ...]) -> str:
+        """Return the name of a shard's file, below the array's directory, from its number along each axis."""
+        return "/".join(("c", *map(str, shard)))
+
+    def _encoded(self, values: NDArray[Any], place: tuple[int, ...]) -> bytes:
+        cut = tuple(slice(i * c, (i + 1) * c) for i, c in zip(place, self.chunk_shape, strict=True))
+        chunk = values[cut]
+        if chunk.shape != self.chunk_shape:
+            whole = np.full(self.chunk_shape, self.fill, self.dtype)
+            whole[tuple(slice(n) for n in chunk.shape)] = chunk
+            chunk = whole
+        return bytes(self.codec.encode(np.ascontiguousarray(chunk)))
+
+    @property
+    def per_shard(self) -> tuple[int, ...]:
+        """Chunks in a shard along each axis."""
+        return tuple(s // c for s, c in zip(self.shard_shape, self.chunk_shape, strict=True))
+
+    def _shard_path(self, shard: tuple[int, ...]) -> Path:
+        return self.path / self.shard_name(shard)
+
+    def _index(self, shard: tuple[int, ...]) -> NDArray[np.uint64]:
+        """Return the shard's table of offsets and sizes, shape (*chunks per shard, 2)."""
+        if shard not in self._indices:
+            path = self._shard_path(shard)
+            offset, size = self._index_span((self.fetched or _LocalShards).size(path))
+            table = np.frombuffer(self._read(path, offset, size), "<u8").reshape(*self.per_shard, 2)
+            start, length = table[..., 0], table[..., 1]
+            lies_within = (start <= offset) & (length >= _CRC_BYTES) & (length <= offset - np.minimum(start, offset))
+            if not (lies_within | (start == _ABSENT)).all():
+                raise ValueError("its index names bytes beyond it")
+            self._indices[shard] = table
+        return self._indices[shard]
+
+    def _read(self, path: Path, offset: int, size: int) -> bytes:
+        """Read so many bytes, the last of which are a checksum, and return the others; `ValueError` if it does not agree."""
+        found = (self.fetched or _LocalShards).read(path, offset, size)
+        content = found[:-_CRC_BYTES]
+        if _compute_crc(content) != found[-_CRC_BYTES:]:
+            raise ValueError("its checksum does not agree")
+        return content
+
+    def _index_span(self, shard_bytes: int) -> tuple[int, int]:
+        """Return offset and size of the table in a shard of so many bytes."""
+        size = 16 * math.prod(self.per_shard) + _CRC_BYTES
+        return max(shard_bytes - size, 0), size
+
+
+def open_sharded(
+    path: Path,
+    *,
+    shape: tuple[int, ...],
+    chunk_shape: tuple[int, ...],
+    shard_shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    fill: float,
+    sparse: bool = False,
+    fetched: FetchedShards | None = None,
+) -> ShardedArray:
+    """Return the array in ``path``, whose numbers come from a card; of its description, ``zarr.json``, only the compression is used.
+
+    `StoreError`: there is no description, or another compression than tcpipe writes.
+    """
+    where = path / DESCRIPTION
+    if not where.exists():
+        raise StoreError(f"{path}: is missing")
+    described: Any = read_json(where)
+    try:
+        codec = _make_codec(**described["codecs"][0]["configuration"]["codecs"][1])
+    except (LookupError, TypeError, ValueError, OverflowError):
+        raise StoreError(f"{where}: its chunks are not in shards and compressed by zstd or blosc") from None
+    return ShardedArray(path, shape, chunk_shape, shard_shape, dtype, fill, sparse, codec, fetched)
+
+
+def _make_codec(name: str, configuration: Mapping[str, Any]) -> Any:
+    """Return the codec that a description names; it decodes all its settings."""
+    if name == "zstd":
+        return numcodecs.Zstd(level=configuration["level"], checksum=configuration["checksum"])
+    if name != "blosc":
+        raise ValueError(name)
+    cname, clevel, blocksize = (configuration[key] for key in ("cname", "clevel", "blocksize"))
+    shuffle = _BLOSC_SHUFFLES[configuration["shuffle"]]
+    return numcodecs.Blosc(cname=cname, clevel=clevel, shuffle=shuffle, blocksize=blocksize)
+
+
+def _decode(codec: Any, data: bytes, out: NDArray[Any]) -> None:
+    """Fill ``out`` with what is encoded; `ValueError` where that is more or less."""
+    size = int.from_bytes(data[4:8], "little") if isinstance(codec, numcodecs.Blosc) else _read_zstd_size(data)
+    if size != out.nbytes:
+        raise ValueError(f"it contains {size} bytes, expected {out.nbytes}")
+    codec.decode(data, out=out)
+
+
+def _read_zstd_size(data: bytes) -> int:
+    """Return how many bytes a frame says that it holds (RFC 8878, 3.1.1); 0 where it does not say."""
+    if len(data) < 5:
+        raise ValueError("it is cut short")
+    flag, is_single, has_dictionary = data[4] >> 6, data[4] >> 5 & 1, data[4] & 3
+    start = 5 + (1 - is_single) + (0, 1, 2, 4)[has_dictionary]
+    width = (is_single, 2, 4, 8)[flag]
+    return int.from_bytes(data[start : start + width], "little") + (256 if width == 2 else 0)
+
+
+def _compute_crc(data: bytes) -> bytes:
+    checksum: int = google_crc32c.value(data)
+    return checksum.to_bytes(_CRC_BYTES, "little")

@@ -81,13 +81,13 @@ class Event:
 def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Floats, Floats, Floats]:
     """Return standard deviation, walk and correlation time of every error, shapes (45,): 0 where it is exact, or nothing depends on it."""
     std, walk = np.zeros(state.N), np.zeros(state.N)
-    has_imu, has_fixes = m.imu is not None, m.gnss is not None
+    has_imu = m.imu is not None
     has_tilt = has_imu or m.has_posed_tilt or (m.visual is not None and m.visual.turn_rate_radps is not None)
     inertial = bool((ticks.inputs.mode == state.INERTIAL).any())
     wanted = {
         "gyroscope bias": has_imu,
         "accelerometer bias": inertial,
-        "lag of fixes": has_fixes and has_tilt,
+        "lag of fixes": has_tilt,
         "turning centre": has_imu,
         "mounting of the IMU": inertial,
         "mounting of the camera": m.visual is not None and bool(m.visual.measured.all()),
@@ -111,15 +111,13 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     std[state.TURN_SCALE] = turn_scale_std(m)
     # Wheels skid otherwise in each turn.
     walk[state.TURN_SCALE] = 0.0 if has_imu else np.sqrt(2.0 / _MINUTE_S) * std[state.TURN_SCALE]
-    # Where roll and pitch are not known, an antenna that sways looks like one at another height; without yaw, elsewhere.
-    if m.gnss is not None and (has_tilt or m.has_attitude):
-        known = slice(0, 3 if has_tilt else 2)
+    if m.gnss is not None:
+        if wanted["lag of fixes"]:
+            std[state.FIX_LAG] = m.gnss.lag_std_s
+        # Where roll and pitch are not known, an antenna that sways looks like one at another height; without yaw, elsewhere.
+        known = slice(0, 3 if has_tilt else 2 if m.has_attitude else 0)
         std[state.ARM : state.ARM + 3][known] = m.gnss.lever_arm_std_m[known]
-    if m.gnss is not None and wanted["lag of fixes"]:
-        std[state.FIX_LAG] = m.gnss.lag_std_s
-    if m.gnss is not None and m.has_attitude:
-        std[state.POSE_MOUNT : state.POSE_MOUNT + 3] = m.gnss.mounting_std_rad
-    if has_fixes:
+        std[state.POSE_MOUNT : state.POSE_MOUNT + 3] = m.gnss.mounting_std_rad if m.has_attitude else 0.0
         std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
     return std, walk, time_s
 

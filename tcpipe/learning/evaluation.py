@@ -65,7 +65,7 @@ from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, LOCAL_PLACES, PLACES, are_near, compute_middles
 from tcpipe.tables.facts import Floor
 from tcpipe.tables.findings import Finding, Remedy, Subject, judge, make_finding, read_threshold
-from tcpipe.terrain.classes import NODATA_ID
+from tcpipe.terrain.layers import NODATA_ID
 
 logger = logging.getLogger("tcpipe")
 

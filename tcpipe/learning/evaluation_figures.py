@@ -23,11 +23,10 @@ from tcpipe.learning.predictions import (
     make_column_name,
 )
 from tcpipe.report.colours import CLASS_COLOURS, FAINT, SPLIT_COLOURS, find_class_colour
-from tcpipe.report.dataset_patches import choose_thinning, make_sheets
 from tcpipe.report.page import Column, Section, Shaded, make_shown_column, pack_columns
+from tcpipe.report.pictures import choose_thinning, make_sheets
 from tcpipe.report.plots import Plot, make_plot
-from tcpipe.tables.arrays import to_texts
-from tcpipe.tables.columns import to_floats
+from tcpipe.tables.columns import to_floats, to_texts
 from tcpipe.tables.findings import read_threshold
 
 _CALLED = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}

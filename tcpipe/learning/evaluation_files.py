@@ -14,14 +14,19 @@ from tcpipe.dataset import open_dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear, write_text
-from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.finding_lines import format_findings, list_verdict
 from tcpipe.formats.integrity import seal_document
 from tcpipe.formats.json_files import digest, parse_json, parse_typed, read_as, read_json, write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.published_outputs import find_newest, require_card, write_output
+from tcpipe.formats.published_outputs import (
+    fetch_directory,
+    fetch_directory_by_range,
+    find_newest,
+    require_card,
+    write_output,
+)
 from tcpipe.learning.baselines import describe_ratios
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation

@@ -21,8 +21,7 @@ from tcpipe.formats.maps.map_facts import Description, read_layers
 from tcpipe.learning.fitting import FitConfig, ModelKind
 from tcpipe.learning.predictor import Inputs, find_kind
 from tcpipe.tables.facts import LEFT_OUT, PhysicsFit
-from tcpipe.terrain.classes import ClassTable, TerrainClass
-from tcpipe.terrain.layers import PAPER_LAYERS, make_paper_layers
+from tcpipe.terrain.layers import PAPER_LAYERS, ClassTable, TerrainClass, make_paper_layers
 
 KIND = "tcpipe model"
 

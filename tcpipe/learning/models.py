@@ -25,13 +25,12 @@ from tcpipe.cost.prediction_errors import Errors, estimate_correlation, fit_erro
 from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
 from tcpipe.errors import ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import write_atomic_directory, write_text
-from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range
 from tcpipe.formats.dataset_files import is_shard, read_card
-from tcpipe.formats.file_checks import find_wrong_files
 from tcpipe.formats.integrity import compute_checksums, read_sealed, seal_document, write_sealed
 from tcpipe.formats.json_files import digest, parse_typed
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.place import Place
+from tcpipe.formats.place import Place, find_wrong_files
+from tcpipe.formats.published_outputs import fetch_directory, fetch_directory_by_range
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current

@@ -21,9 +21,8 @@ from tcpipe.learning.model_card import ModelCard
 from tcpipe.learning.models import Model
 from tcpipe.learning.predictor import Prediction
 from tcpipe.learning.training import compute_dataset_checksum, read_class_table
-from tcpipe.tables.arrays import to_texts
-from tcpipe.tables.columns import Column, to_floats
-from tcpipe.terrain.classes import ClassTable
+from tcpipe.tables.columns import Column, to_floats, to_texts
+from tcpipe.terrain.layers import ClassTable
 
 CALLED = {"w": "power", "v": "velocity", "T": "duration", "E": "energy"}
 """What columns of tables call the quantities."""

@@ -20,11 +20,10 @@ from tcpipe.dataset.extra_features import ExtraFeature, available_features, read
 from tcpipe.dataset.tensor import ONE_HOT
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
-from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.published_outputs import find_newest, write_output
+from tcpipe.formats.published_outputs import fetch_directory, find_newest, write_output
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, compute_costs
 from tcpipe.learning.model_card import KIND, LayerRange, ModelCard, TrainedOn, Training, TrainingRange, format_readme
@@ -44,8 +43,7 @@ from tcpipe.learning.predictor import (
     find_held_out,
     find_kind,
 )
-from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import COLOURS, LAYERS, PAPER_LAYERS
+from tcpipe.terrain.layers import COLOURS, LAYERS, NODATA_ID, PAPER_CLASSES, PAPER_LAYERS, ClassTable
 from tcpipe.terrain.sampling import compute_relief_m
 
 logger = logging.getLogger("tcpipe")

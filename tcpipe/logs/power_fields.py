@@ -6,8 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from tcpipe.logs.column_names import translate
-from tcpipe.logs.expressions import UNITS, split_unit
+from tcpipe.logs.expressions import UNITS, split_unit, translate
 
 SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr", "bl", "br"})
 

@@ -1,6 +1,6 @@
 """What a message definition says of the bytes: scalars, texts, arrays and records, as one small tree; and the text of a definition.
 
-Both ROS 1 serialisation and CDR lay these types out field after field; how is `tcpipe.logs.wire_cursors`'s knowledge.
+Both ROS 1 serialisation and CDR lay these types out field after field; how is `tcpipe.logs.wire_types`'s knowledge.
 
 A .msg definition (http://wiki.ros.org/msg, and ROS 2's bounds and defaults) in a log holds the message first, then every message it is
 made of, each below a line of ``=`` and ``MSG: package/Name``. Constants, defaults and comments do not matter for reading.
@@ -9,8 +9,12 @@ made of, each below a line of ``=`` and ``MSG: package/Name``. Constants, defaul
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.logs.topics import normalize_type_name
 
@@ -194,3 +198,338 @@ def _parse_field_type(found: re.Match[str], owner: str) -> FieldType:
         raise MsgTextError(f"{owner}: {found['name']} is bounded by nothing")
     fixed = bool(found["size"]) and not found["most"]
     return FieldType(name, limit, int(found["size"] or 0), fixed)
+
+
+Int64Array = NDArray[np.int64]
+
+_MAX_STEPS = 20_000
+"""A walk of more steps is given up: a few endless lists among short ones are cheaper to read one by one."""
+_CDR_BYTE_ORDER = {0: ">", 1: "<", 6: ">", 7: "<"}
+_PLAIN_XCDR2 = (6, 7)
+_XCDR2_ALIGNMENT = 4
+_CDR_HEADER = 4
+_CDR_PADDING = 3
+
+
+class LayoutError(ValueError):
+    """Messages do not fit their definition: a length runs past their end, or bytes are left over."""
+
+
+class RaggedError(ValueError):
+    """Messages are too irregular to be read by columns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """How messages are serialised.
+
+    Fields begin ``origin`` bytes into a message, are aligned from there to at most ``max_alignment``; texts end in ``terminator`` bytes
+    that are no text; a message without fields takes ``empty_record_bytes``; up to ``padding`` bytes may follow the last field.
+    """
+
+    byte_order: str
+    origin: int
+    max_alignment: int
+    terminator: int
+    empty_record_bytes: int
+    padding: int
+
+    @property
+    def known_to_rosbags(self) -> bool:
+        """Whether rosbags reads it, too (all but XCDR2)."""
+        return self.max_alignment != _XCDR2_ALIGNMENT
+
+
+ROS1 = Dialect("<", 0, 1, 0, 0, 0)
+
+
+def find_dialect(payload: bytes, encoding: str) -> Dialect:
+    """Return the dialect of a message, in CDR by its first bytes; `LayoutError` where these are none of CDR's plain ones."""
+    if encoding == "ros1":
+        return ROS1
+    if len(payload) < _CDR_HEADER or payload[0] != 0 or payload[1] not in _CDR_BYTE_ORDER:
+        raise LayoutError(f"CDR header {payload[:_CDR_HEADER].hex(' ')} is invalid in ROS 2")
+    max_alignment = _XCDR2_ALIGNMENT if payload[1] in _PLAIN_XCDR2 else 8
+    return Dialect(_CDR_BYTE_ORDER[payload[1]], _CDR_HEADER, max_alignment, 1, 1, _CDR_PADDING)
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Places at equal distances: the first, and of each axis how many there are and how far apart."""
+
+    first: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+    def view(self, data: NDArray[np.uint8], dtype: np.dtype[np.generic], count: int = 1) -> NDArray[np.generic]:
+        """Return a copy of the values there, ``count`` of them side by side at each place, in the order of `list_offsets`."""
+        together = dtype if count == 1 else np.dtype(f"V{count * dtype.itemsize}")  # many at once are copied faster
+        if not count:
+            return np.zeros(0, dtype)
+        found: NDArray[np.generic] = np.ndarray(self.shape, together, data, self.first, self.strides)
+        return found.copy().reshape(-1).view(dtype)
+
+    def list_offsets(self) -> Int64Array:
+        """Return all of them, the last axis first."""
+        offsets = np.full(1, self.first, np.int64)
+        for count, stride in zip(self.shape, self.strides, strict=True):
+            offsets = (offsets[:, None] + stride * np.arange(count)).ravel()
+        return offsets
+
+
+Places = Int64Array | Grid
+"""Where the M values of a field lie, as an array (M,) or a grid."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scalars:
+    """Scalars at their places."""
+
+    places: Places
+    dtype: np.dtype[np.generic]
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """``lengths`` bytes each, shape (M,), equal in a grid: scalars side by side, or a text (``dtype`` None)."""
+
+    places: Places
+    lengths: Int64Array
+    dtype: np.dtype[np.generic] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Fields:
+    """The fields of ``count`` records."""
+
+    count: int
+    fields: tuple[Values, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Lists:
+    """M lists of ``counts`` elements each; ``elements`` are those of all lists, one list after the other."""
+
+    counts: Int64Array
+    elements: Values
+
+
+Values = Scalars | Runs | Fields | Lists
+
+
+@dataclass(frozen=True, slots=True)
+class WalkResult:
+    """What a walk found; ``fits`` (N,) says which messages fit their definition: the values are those of these only."""
+
+    root: Fields | None
+    fits: NDArray[np.bool_]
+
+
+def walk(
+    message: Record, data: NDArray[np.uint8], starts: Int64Array, ends: Int64Array, dialect: Dialect
+) -> WalkResult:
+    """Find every field of every message; `RaggedError` where they are so unlike that they are cheaper to read one by one.
+
+    Each begins and ends in ``data`` at ``starts`` and ``ends``, shape (N,), rising.
+    """
+    fits = np.ones(len(starts), np.bool_)
+    while fits.any():
+        bases, sizes = starts[fits] + dialect.origin, ends[fits] - starts[fits] - dialect.origin
+        cursors = _Cursors(data, _find_grid(bases, sizes), sizes, dialect)
+        try:
+            root = cursors.record(message, np.arange(len(sizes)))
+        except LayoutError:  # which stands for all of them
+            break
+        good = cursors.find_finished()
+        if good.all():
+            return WalkResult(root, fits)
+        fits[fits] = good
+    return WalkResult(None, np.zeros(len(starts), np.bool_))
+
+
+def _find_grid(bases: Int64Array, sizes: Int64Array) -> Places:
+    """Return bases as a grid where messages of one size lie at equal distances."""
+    steps = np.diff(bases)
+    if (sizes != sizes[0]).any() or (steps != steps[:1]).any():
+        return bases
+    return Grid(int(bases[0]), (len(bases),), (int(steps[0]) if len(steps) else 1,))
+
+
+class _Cursors:
+    """A position in each message, counted from where its fields begin; a message that does not fit is marked, and stands still.
+
+    While ``_bases`` is a grid, messages have one size, ``_at`` is the position in all of them, and one that does not fit is an error.
+    """
+
+    def __init__(self, data: NDArray[np.uint8], bases: Places, sizes: Int64Array, dialect: Dialect) -> None:
+        self._data, self._bases, self._sizes, self._dialect = data, bases, sizes, dialect
+        self._at, self._steps = 0, 0
+        self._positions, self._good = np.zeros(len(sizes), np.int64), sizes >= 0
+        self._counts: NDArray[np.void] = np.ndarray(
+            (max(len(data) - 3, 0),), "V4", data if len(data) > 3 else b"", 0, (1,)
+        )
+
+    def find_finished(self) -> NDArray[np.bool_]:
+        """Return which messages fit, and have no more bytes left than may follow the last field."""
+        left = self._sizes - (self._at if isinstance(self._bases, Grid) else self._positions)
+        finished: NDArray[np.bool_] = self._good & (left >= 0) & (left <= self._dialect.padding)
+        return finished
+
+    def values(self, wire_type: WireType, rows: Int64Array) -> Values:
+        """Step over one value in each of the ``rows``: all messages, none, or some of those without a grid."""
+        self._steps += 1
+        if self._steps > _MAX_STEPS:
+            raise RaggedError(f"more than {_MAX_STEPS} steps")
+        match wire_type:
+            case Scalar():
+                dtype = np.dtype(self._dialect.byte_order + wire_type.code)
+                return Scalars(self.take(rows, dtype.itemsize, dtype.itemsize), dtype)
+            case Text():
+                lengths = self.count(rows)
+                kept = np.maximum(lengths - self._dialect.terminator, 0)
+                return Runs(self.take(rows, lengths, 1), np.broadcast_to(kept, len(rows)), None)
+            case Record():
+                return self.record(wire_type, rows)
+            case Array():
+                return self.array(wire_type, rows)
+
+    def record(self, record: Record, rows: Int64Array) -> Fields:
+        if not record.fields:  # CDR has no empty structures: rosidl puts one byte there
+            self.take(rows, self._dialect.empty_record_bytes, 1)
+        return Fields(len(rows), tuple(self.values(field, rows) for _, field in record.fields))
+
+    def array(self, array: Array, rows: Int64Array) -> Values:
+        counts = self.count(rows) if array.length is None else array.length
+        if isinstance(self._bases, Grid) and len(rows):
+            if counts > self._sizes[0] - self._at:  # an element takes a byte at least
+                raise LayoutError(f"{counts} elements")
+        else:
+            endless = counts > self._sizes[rows] - self._positions[rows]
+            self._good[rows[endless]] = False
+            counts = np.where(endless, 0, counts)
+        if isinstance(array.element, Scalar):
+            dtype = np.dtype(self._dialect.byte_order + array.element.code)
+            sizes = counts * dtype.itemsize
+            places = self.take(rows, sizes, np.where(counts > 0, dtype.itemsize, 1))
+            return Runs(places, np.broadcast_to(sizes, len(rows)), dtype)
+        each = np.broadcast_to(counts, len(rows))
+        return Lists(each, self.regular(array.element, rows, each) or self.elements(array.element, rows, each))
+
+    def elements(self, element: Text | Record, rows: Int64Array, counts: Int64Array) -> Values:
+        """Step over the first elements of all lists, then over the second ones, and so on."""
+        if not counts.any():
+            return self.values(element, rows[:0])
+        pieces, places = [], []
+        starts = np.cumsum(counts) - counts
+        for index in range(int(counts.max())):
+            longer = np.flatnonzero(counts > index)
+            pieces.append(self.values(element, rows[longer]))
+            places.append(starts[longer] + index)
+        order = np.empty(int(counts.sum()), np.int64)
+        order[np.concatenate(places)] = np.arange(len(order))
+        return _join_values(pieces, order)
+
+    def regular(self, element: Text | Record, rows: Int64Array, counts: Int64Array) -> Values | None:
+        """Step over all elements at once where each takes the same room wherever it stands; None where they do not."""
+        size, stride, alignment = _find_regular_size(element, self._dialect.max_alignment)
+        if not size or counts.max(initial=0) < 2:
+            return None
+        sizes = np.where(counts > 0, stride * (counts - 1) + size, 0)
+        is_grid = isinstance(self._bases, Grid)
+        begin = self.take(
+            rows, int(sizes[0]) if is_grid else sizes, alignment if is_grid else np.where(counts > 0, alignment, 1)
+        )
+        places: Places
+        if isinstance(begin, Grid):
+            places = Grid(begin.first, (*begin.shape, int(counts[0])), (*begin.strides, stride))
+        else:
+            owners = np.repeat(np.arange(len(rows)), counts)
+            places = begin[owners] + stride * (np.arange(len(owners)) - (np.cumsum(counts) - counts)[owners])
+        total = int(counts.sum())
+        return _Cursors(self._data, places, np.full(total, size), self._dialect).values(element, np.arange(total))
+
+    def count(self, rows: Int64Array) -> int | Int64Array:
+        """Step over a length in each row; return them, as one number where all messages have the same."""
+        places, dtype = self.take(rows, 4, 4), np.dtype(self._dialect.byte_order + "u4")
+        if isinstance(places, Grid):
+            counts = places.view(self._data, dtype).astype(np.int64)
+            if (counts == counts[0]).all():
+                return int(counts[0])
+            self._positions[:] = self._at  # from here on each has its own
+            self._bases = _list_offsets(self._bases)
+            return counts
+        good = self._good[rows]
+        found = np.zeros(len(rows), np.int64)
+        found[good] = self._counts[places[good]].view(dtype)
+        return found
+
+    def take(self, rows: Int64Array, sizes: int | Int64Array, alignment: int | Int64Array) -> Places:
+        """Move over ``sizes`` bytes after alignment; return where they begin."""
+        if not len(rows):
+            return rows
+        mask = np.minimum(alignment, self._dialect.max_alignment) - 1
+        if isinstance(self._bases, Grid):
+            begin = int((self._at + mask) & ~mask)
+            if begin + sizes > self._sizes[0]:
+                raise LayoutError(f"byte {begin + sizes}")
+            self._at = int(begin + sizes)
+            return Grid(self._bases.first + begin, self._bases.shape, self._bases.strides)
+        offsets: Int64Array = (self._positions[rows] + mask) & ~mask
+        after = offsets + sizes
+        past = after > self._sizes[rows]
+        if past.any():
+            self._good[rows[past]] = False
+            after = np.where(past, self._positions[rows], after)
+        self._positions[rows] = after
+        return offsets + self._bases[rows]
+
+
+def _list_offsets(places: Places) -> Int64Array:
+    return places.list_offsets() if isinstance(places, Grid) else places
+
+
+def _join_values(pieces: Sequence[Values], order: Int64Array) -> Values:
+    """Concatenate values and put them in order: the n-th is number ``order[n]`` of the concatenation."""
+    match pieces[0]:
+        case Scalars(dtype=dtype):
+            scalars = [_list_offsets(p.places) for p in pieces if isinstance(p, Scalars)]
+            return Scalars(np.concatenate(scalars)[order], dtype)
+        case Runs(dtype=dtype):
+            runs = [(_list_offsets(p.places), p.lengths) for p in pieces if isinstance(p, Runs)]
+            offsets, lengths = (np.concatenate(parts)[order] for parts in zip(*runs, strict=True))
+            return Runs(offsets, lengths, dtype)
+        case Fields():
+            columns = zip(*(p.fields for p in pieces if isinstance(p, Fields)), strict=True)
+            return Fields(len(order), tuple(_join_values(column, order) for column in columns))
+        case Lists():
+            lists = [p for p in pieces if isinstance(p, Lists)]
+            counts = np.concatenate([p.counts for p in lists])
+            starts, chosen = np.cumsum(counts) - counts, counts[order]
+            within = np.arange(int(chosen.sum())) - np.repeat(np.cumsum(chosen) - chosen, chosen)
+            return Lists(chosen, _join_values([p.elements for p in lists], np.repeat(starts[order], chosen) + within))
+
+
+@cache
+def _find_regular_size(wire_type: WireType, max_alignment: int) -> tuple[int, int, int]:
+    """Return size, distance and alignment of values that follow one another, where these are the same wherever they stand; (0, 0, 1) else.
+
+    They are where the first field has the largest alignment.
+    """
+    match wire_type:
+        case Scalar():
+            size = np.dtype(wire_type.code).itemsize
+            return size, size, min(size, max_alignment)
+        case Record() if wire_type.fields:
+            parts = [_find_regular_size(field, max_alignment) for _, field in wire_type.fields]
+            alignment = parts[0][2]
+            position = 0
+            for size, _, own in parts:
+                if not size or own > alignment:
+                    return 0, 0, 1
+                position += -position % own + size
+            return position, position + -position % alignment, alignment
+        case Array() if wire_type.length:
+            size, stride, alignment = _find_regular_size(wire_type.element, max_alignment)
+            return (stride * (wire_type.length - 1) + size if size else 0), 0, alignment
+        case _:
+            return 0, 0, 1

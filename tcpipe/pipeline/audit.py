@@ -29,16 +29,14 @@ from tcpipe.fusion.withheld import (
     score_comparisons,
 )
 from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
-from tcpipe.pipeline.named_runs import find_named_run, is_path
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig, Recipe
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.fuse_inputs import Section, prepare_sections
 from tcpipe.stages.message_arrays import find_fixes_role, use_pose_as_fixes
 from tcpipe.stages.read import find_read_config, read_run
-from tcpipe.store import is_store
-from tcpipe.tables.arrays import number_column, select_rows
-from tcpipe.tables.columns import read_float_columns, to_integers
+from tcpipe.store import find_named_run, is_path, is_store
+from tcpipe.tables.columns import number_column, read_float_columns, select_rows, to_integers
 from tcpipe.tables.levels import Streams, Track
 
 Ints = NDArray[np.int64]
@@ -118,7 +116,12 @@ def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> It
         raise FusionError("the rest has no track in the windows, or the robot is stationary there")
     numbers, sensor = np.flatnonzero(moving), run.section.measurements.sensors()[role]
     if isinstance(sensor, Positions):
-        sensor = _move_origin(sensor, run.section, track)
+        datum = track.info.datum
+        if datum is None or run.section.datum_deg_m is None:
+            raise FusionError("the track of the rest has only local coordinates")
+        places = geodetic_from_enu(sensor.position_enu_m, datum_deg_m=run.section.datum_deg_m)
+        moved = enu_from_geodetic(*places, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m))
+        sensor = replace(sensor, position_enu_m=moved)
         arm_m, arm_std_m = np.asarray(run.streams.sensors[find_fixes_role(run.streams)].xyz_m), np.zeros(3)
         if facts.fuse and any(finding.code in _OTHER_ARM for finding in track.info.report.findings):
             arm = facts.fuse.longest.parameters["antenna"]
@@ -143,16 +146,6 @@ def withhold(streams: Streams, role: str, epoch: int, windows_ns: Ints) -> Strea
     return replace(
         streams, tables={name: keep(table) if name in without else table for name, table in streams.tables.items()}
     )
-
-
-def _move_origin(fixes: Positions, section: Section, track: Track) -> Positions:
-    """Return the fixes in the track's own plane: its origin is the first fixes, of which some may be withheld."""
-    datum = track.info.datum
-    if datum is None or section.datum_deg_m is None:
-        raise FusionError("the track of the rest has only local coordinates")
-    places = geodetic_from_enu(fixes.position_enu_m, datum_deg_m=section.datum_deg_m)
-    moved = enu_from_geodetic(*places, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m))
-    return replace(fixes, position_enu_m=moved)
 
 
 def _compare_lengths(run: _Run) -> dict[str, float]:

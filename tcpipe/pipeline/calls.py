@@ -20,8 +20,7 @@ from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.execution import read_cluster_cpu_s
 from tcpipe.formats.documents import State, parse_name
 from tcpipe.formats.json_files import to_plain
-from tcpipe.formats.runs import RunFacts
-from tcpipe.formats.store_records import Call, Problem, Process
+from tcpipe.formats.runs import Call, Problem, Process, RunFacts
 from tcpipe.store import Store, is_store
 from tcpipe.tables.findings import Remedy, Subject, make_finding
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,11 +13,10 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import clean_lines
-from tcpipe.formats.bucket_directories import fetch_directory
-from tcpipe.formats.dataset_card import DatasetCard, MapSource
+from tcpipe.formats.dataset_card import Change, DatasetCard, MapSource, compare_records, format_value
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches, read_card, read_samples, sample_columns
-from tcpipe.formats.dataset_inputs import Change, compare_records, format_value
 from tcpipe.formats.finding_lines import format_findings
+from tcpipe.formats.published_outputs import fetch_directory
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.findings import Finding, Subject
@@ -30,7 +30,6 @@ _SHARED = 0.9
 
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-Describe = Callable[[Change, DatasetCard, DatasetCard], Iterator[str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,114 +223,36 @@ def _count_moved(ours: NDArray[np.object_], theirs: NDArray[np.object_]) -> dict
     return {name: count for name, count in moves.items() if count}
 
 
+_WORDS = {
+    "versions": "version", "runs": "run", "tags": "chosen tags", "maps": "map", "map_names": "order of maps", "exclusions": "exclusion",
+    "file_format": "format",
+}  # fmt: skip
+"""What a field of `DatasetInputs` is called; others by their name."""
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+
+
 def list_causes(a: DatasetCard, b: DatasetCard) -> tuple[str, ...]:
     """Return a line for each entry of the records of two datasets that differs, in the order of the fields."""
     changes = list(compare_records(a.made_from, b.made_from))
-    lines = [
-        line
-        for field, describe in _CAUSES.items()
-        for change in changes
-        if change.path[0] == field
-        for line in describe(change, a, b)
-    ]
+    lines = [_describe_change(change, a, b) for change in changes]
     if a.inputs != b.inputs and not changes:
         lines.append("inputs: differ, but a dataset without coordinates does not store them")
-    return tuple(dict.fromkeys(lines))
+    return tuple(lines)
 
 
-def _describe_change(word: str) -> Describe:
-    """Return a function that describes changes of plain values, whose name and values are all there is to say."""
-
-    def describe(change: Change, _a: DatasetCard, _b: DatasetCard) -> Iterator[str]:
-        name = f"{change.name} " if change.name else ""
-        yield f"{word}: {name}{format_value(change.was)} → {format_value(change.now)}"
-
-    return describe
-
-
-def _describe_version(change: Change, _a: DatasetCard, _b: DatasetCard) -> Iterator[str]:
-    yield f"{change.name} version {format_value(change.was)} → {format_value(change.now)}"
-
-
-def _describe_file(word: str, kind: str) -> Describe:
-    """Return a function that describes changes of files, of which the content differs."""
-
-    def describe(change: Change, _a: DatasetCard, _b: DatasetCard) -> Iterator[str]:
-        which = "added" if change.was is None else "removed" if change.now is None else ""
-        name = f"{change.name} is " if change.name else ""
-        yield f"{word}: {f'{which} {change.name}' if which else f'{name}another {kind}'}".rstrip()
-
-    return describe
-
-
-def _describe_run(change: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]:
-    """Yield what differs in a run; of a run with other segments all but its tags follows from them."""
-    run_id, *key = change.path[1:]
-    was, now = a.made_from.runs.get(run_id), b.made_from.runs.get(run_id)
-    if (one := now or was) is not None and None in (was, now):
-        which, card = ("added", b) if was is None else ("removed", a)
-        samples = sum(run.samples for run in card.runs if run.run_id == run_id)
-        yield f"log: {which} {', '.join(one.logs)} (run {run_id}, {samples} samples)"
-    elif was is None or now is None:
-        return
-    elif key[0] == "tags":
-        yield f"tags: run {run_id} {'.'.join(key[1:])} {format_value(change.was)} → {format_value(change.now)}"
-    elif was.segments_sha256 != now.segments_sha256:
-        other = was.recipe_id != now.recipe_id
-        again = (
-            f"ingested with recipe {was.recipe_id} → {now.recipe_id}"
-            if other
-            else "the same log and recipe, ingested again"
-        )
-        yield f"log: run {run_id} has other segments: {again}"
-    else:
-        yield f"log: run {run_id} {key[0]} {format_value(change.was)} → {format_value(change.now)}"
-
-
-def _describe_exclusion(change: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]:
-    name = change.path[1]
-    was, now = (next((each for each in card.exclusions if each.name == name), None) for card in (a, b))
-    if was is not None and now is not None:
-        yield f"exclusion: {name} is another list: {was.samples} → {now.samples} samples, {was.reason} → {now.reason}"
-    elif (one := now or was) is not None:
-        yield f"exclusion: {'removed' if now is None else 'added'} {name} ({one.samples} samples): {one.reason}"
-
-
-def _describe_map(change: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]:
-    was, now = (next((each for each in card.maps if each.name == change.name), None) for card in (a, b))
-    if was is None or now is None:
-        yield f"map: {'added' if was is None else 'removed'} {change.name}"
-    else:
-        yield f"map: {change.name} is another one: {', '.join(_map_changes(was, now)) or 'its files were made again'}"
-
-
-def _describe_order(change: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]:
-    if a.made_from.maps.keys() == b.made_from.maps.keys():
-        yield f"map: order {format_value(change.was)} → {format_value(change.now)}"
-
-
-def _describe_region(_: Change, a: DatasetCard, b: DatasetCard) -> Iterator[str]:
-    yield f"region: {'added' if a.made_from.region is None else 'removed' if b.made_from.region is None else 'another one'}"
-
-
-_CAUSES: dict[str, Describe] = {
-    "versions": _describe_version,
-    "recipe": _describe_change("recipe"),
-    "runs": _describe_run,
-    "robots": _describe_change("robots"),
-    "tags": _describe_change("chosen tags"),
-    "maps": _describe_map,
-    "map_names": _describe_order,
-    "region": _describe_region,
-    "covariates": _describe_file("covariates", "table"),
-    "exclusions": _describe_exclusion,
-    "kept_split": _describe_file("kept split", "one"),
-    "file_format": _describe_change("format"),
-    "labels": _describe_change("labels"),
-    "without_patches": _describe_change("without patches"),
-    "without_coordinates": _describe_change("without coordinates"),
-}
-"""By field of `DatasetInputs`: what to say of a change."""
+def _describe_change(change: Change, a: DatasetCard, b: DatasetCard) -> str:
+    """Return what differs in an entry, by its value or, of content, that it is another."""
+    field = change.path[0]
+    head, name = _WORDS.get(field, field.replace("_", " ")), f" {change.name}" if change.name else ""
+    values = (change.was, change.now)
+    is_content = any(isinstance(value, Mapping) or _DIGEST.fullmatch(str(value)) for value in values)
+    if not is_content:
+        return f"{head}:{name} {format_value(change.was)} → {format_value(change.now)}"
+    if None in values:
+        return f"{head}: {'added' if change.was is None else 'removed'}{name}"
+    maps = [next((each for each in card.maps if field == "maps" and each.name == change.name), None) for card in (a, b)]
+    details = ", ".join(_map_changes(*maps)) if maps[0] and maps[1] else ""  # type: ignore[arg-type]
+    return f"{head}:{name} is another one{f': {details}' if details else ''}"
 
 
 def _map_changes(a: MapSource, b: MapSource) -> Iterator[str]:

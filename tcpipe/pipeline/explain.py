@@ -14,7 +14,6 @@ import pyarrow.compute as pc
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, clean_lines
-from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard, MapSource
 from tcpipe.formats.dataset_files import (
     SAMPLES,
@@ -27,6 +26,7 @@ from tcpipe.formats.dataset_files import (
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_table
+from tcpipe.formats.published_outputs import fetch_directory_by_range
 from tcpipe.formats.runs import RunFacts
 from tcpipe.formats.stored_runs import StoredRun, read_streams
 from tcpipe.recipe import Recipe

@@ -15,7 +15,7 @@ import pyarrow as pa
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError
 from tcpipe.formats.atomic import clear
-from tcpipe.formats.json_files import parse_typed, read_json, write_json
+from tcpipe.formats.json_files import read_as, write_json
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.logs.log_joining import AnyLog, open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
@@ -45,22 +45,22 @@ class ExportOrigin:
 
 @dataclass(frozen=True, slots=True)
 class IndexEntry:
-    """What an export's index has of a topic; no file where it cannot be read."""
+    """A topic's file; None where the topic cannot be read."""
 
     file: str | None
     bytes: int
     type: str
     rows: int
-    made_from: ExportOrigin
-    damage: tuple[Finding, ...]
-    notes: tuple[Finding, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class ExportIndex:
     """All of export.json."""
 
+    made_from: ExportOrigin
     topics: Mapping[str, IndexEntry]
+    damage: tuple[Finding, ...]
+    notes: tuple[Finding, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,31 +110,27 @@ def export(
         wanted = _select_topics(log, shown, topics)
         made_from = _make_origin(log, shown, message_definitions)
         paths = _make_paths(out, sorted(log.topics))
-        index = _index(out)
+        index = _read_index(out)
         _refuse_others_files(index, made_from, {name: paths[name] for name in wanted})
-        known = {name for name in wanted if _is_there(index.get(name), made_from, out)}
-        if wanted and known == set(wanted):
+        known = index.topics if index is not None and index.made_from == made_from else {}
+        if index is not None and wanted and all(_is_there(known.get(name), out) for name in wanted):
             return _make_exported("unchanged", index, wanted, shown, out)
         rows = _write(log, {name: paths[name] for name in wanted})
         if wanted and not any(count is not None for count in rows.values()):
             raise LogError(f"{shown}: nothing to export: no topic can be read", findings=log.findings)
-        damage, notes = split_notes(log.findings)
-        if not wanted:
-            return Exported(shown, out, "done", (), damage, notes, 3 if damage else 0)
         entries = {
             name: IndexEntry(
                 file=None if count is None else paths[name].name,
                 bytes=0 if count is None else paths[name].stat().st_size,
                 type=log.topics[name].type_name,
                 rows=count or 0,
-                made_from=made_from,
-                damage=damage,
-                notes=notes,
             )
             for name, count in rows.items()
         }
-    write_json(out / INDEX, ExportIndex({**index, **entries}))
-    return _make_exported("done", entries, wanted, shown, out)
+        index = ExportIndex(made_from, {**known, **entries}, *split_notes(log.findings))
+    if wanted:
+        write_json(out / INDEX, index)
+    return _make_exported("done", index, wanted, shown, out)
 
 
 def _select_topics(log: AnyLog, log_path: str, topics: Sequence[str]) -> list[str]:
@@ -159,14 +155,12 @@ def _make_origin(log: AnyLog, log_path: str, message_definitions: Path | None) -
     )
 
 
-def _index(out: Path) -> dict[str, IndexEntry]:
-    """Return what ``out`` holds by topic; an entry that is not as this version writes it counts for nothing."""
-    entries = read_json(out / INDEX).get("topics") if (out / INDEX).is_file() else None
-    found: dict[str, IndexEntry] = {}
-    for name, entry in entries.items() if isinstance(entries, dict) else ():
+def _read_index(out: Path) -> ExportIndex | None:
+    """Return what ``out`` holds; an index that is not as this version writes it counts for nothing."""
+    if (out / INDEX).is_file():
         with suppress(StoreError):
-            found[name] = parse_typed(entry, IndexEntry, out / INDEX)
-    return found
+            return read_as(out / INDEX, ExportIndex)
+    return None
 
 
 def _refuse_what_is_ours(out: Path) -> None:
@@ -180,13 +174,14 @@ def _refuse_what_is_ours(out: Path) -> None:
         raise UsageError(f"{out}: is a {kind}; give another directory for the topics")
 
 
-def _refuse_others_files(index: Mapping[str, IndexEntry], made_from: ExportOrigin, paths: Mapping[str, Path]) -> None:
-    others = {topic.file: topic.made_from.log for topic in index.values() if topic.made_from.log != made_from.log}
-    taken = sorted({others[path.name] for path in paths.values() if path.name in others})
-    if taken:
-        out = next(iter(paths.values())).parent
-        raise UsageError(f"{out}: contains the same topics of {', '.join(taken)}; give another directory")
-    known = {entry.file for entry in index.values()}
+def _refuse_others_files(index: ExportIndex | None, made_from: ExportOrigin, paths: Mapping[str, Path]) -> None:
+    """Refuse to write into the export of another log, or over a file that is none of an export."""
+    known = set[str | None]()
+    if index is not None:
+        known = {entry.file for entry in index.topics.values()}
+        if index.made_from.log != made_from.log:
+            out = next(iter(paths.values())).parent
+            raise UsageError(f"{out}: contains topics of {index.made_from.log}; give another directory")
     strange = [path for path in paths.values() if path.exists() and path.name not in known and not _is_a_topics(path)]
     if strange:
         raise UsageError(*(f"{path}: exists and is not an exported topic; give another directory" for path in strange))
@@ -199,23 +194,19 @@ def _is_a_topics(path: Path) -> bool:
     return False
 
 
-def _is_there(entry: IndexEntry | None, made_from: ExportOrigin, out: Path) -> bool:
-    if entry is None or entry.made_from != made_from:
-        return False
-    path = None if entry.file is None else out / entry.file
-    return path is None or (path.is_file() and path.stat().st_size == entry.bytes)
+def _is_there(entry: IndexEntry | None, out: Path) -> bool:
+    path = None if entry is None or entry.file is None else out / entry.file
+    return entry is not None and (path is None or (path.is_file() and path.stat().st_size == entry.bytes))
 
 
 def _make_exported(
-    status: Literal["done", "unchanged"], entries: Mapping[str, IndexEntry], wanted: Sequence[str], log: str, out: Path
+    status: Literal["done", "unchanged"], index: ExportIndex, wanted: Sequence[str], log: str, out: Path
 ) -> Exported:
-    found = {name: entries[name] for name in wanted}
+    found = {name: index.topics[name] for name in wanted}
     files = tuple(
         ExportedTopic(name, topic.type, out / topic.file, topic.rows) for name, topic in found.items() if topic.file
     )
-    damage = dict.fromkeys(finding for topic in found.values() for finding in topic.damage)
-    notes = dict.fromkeys(finding for topic in found.values() for finding in topic.notes)
-    return Exported(log, out, status, files, tuple(damage), tuple(notes), 3 if damage else 0)
+    return Exported(log, out, status, files, index.damage, index.notes, 3 if index.damage else 0)
 
 
 def _write(log: AnyLog, paths: Mapping[str, Path]) -> dict[str, int | None]:

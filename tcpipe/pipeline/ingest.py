@@ -9,7 +9,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, clean_line, list_first
@@ -19,20 +19,53 @@ from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_presigned, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
-from tcpipe.formats.runs import find_problems
-from tcpipe.formats.store_records import Failure, find_lineage, make_failure
+from tcpipe.formats.runs import Failure, find_lineage, find_problems, make_failure
 from tcpipe.pipeline.calls import INGEST, RunningCall, count_bytes, estimate, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
-from tcpipe.pipeline.log_queue import Item, iterate_rounds, make_tasks
-from tcpipe.pipeline.log_sources import FoundLogs, find_failure, find_sources, select_shard
+from tcpipe.pipeline.log_sources import (
+    FoundLogs,
+    LogSource,
+    find_failure,
+    find_sources,
+    make_definitions_key,
+    select_shard,
+)
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result, plan
 from tcpipe.pipeline.problems import is_acknowledged
-from tcpipe.recipe import TimeWindow
+from tcpipe.recipe import Recipe, TimeWindow
 from tcpipe.store import is_store, open_store
 from tcpipe.tables.findings import select_problems
 from tcpipe.tables.levels import RESULTS_VERSION
 from tcpipe.tables.options import as_function
+
+
+def make_tasks(
+    sources: Iterable[LogSource], options: IngestOptions, root: Path | str, recipe: Recipe
+) -> list[IngestTask]:
+    """Return the task of each log; on a cluster, whose workers are elsewhere, with absolute paths."""
+    definitions = None if options.message_definitions is None else Path(options.message_definitions)
+    if options.cluster is not None:
+        root = root.absolute() if isinstance(root, Path) else root
+        definitions = definitions and definitions.absolute()
+    robot, tags = options.robot or recipe.robot, dict(options.tags or {})
+    how = (root, recipe, robot, tags, options.force, definitions, make_definitions_key(definitions))
+    return [IngestTask(source, *how, options.retry_failed, options.min_age_s) for source in sources]
+
+
+Item: TypeAlias = tuple[int, IngestTask]
+
+
+def iterate_rounds(steps: Sequence[Step]) -> list[list[Item]]:
+    """Return logs to ingest side by side, then those with the size of one of them: the first of equal logs names their run."""
+    sizes, rounds = set[int](), [list[Item](), list[Item]()]
+    for index, step in enumerate(steps):
+        if step.is_todo:
+            size_bytes = step.task.source.size_bytes
+            rounds[size_bytes in sizes].append((index, step.task))
+            sizes.add(size_bytes)
+    return rounds
+
 
 logger = logging.getLogger("tcpipe")
 
@@ -228,18 +261,11 @@ def _iterate_results(
     """Yield what became of each log by its index, as it ends."""
     known = {problem.key for row in call.state.runs.values() for problem in find_problems(row)}
     for turn in iterate_rounds(steps):
-        taken = list[Item]()
-        with closing(run_all(ingest_one, _take_tasks(turn, taken), jobs=jobs, cluster=cluster)) as outcomes:
+        with closing(run_all(ingest_one, [task for _, task in turn], jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
-                index, task = taken[outcome.index]
+                index, task = turn[outcome.index]
                 ended = outcome.result or Ingested(task.source, make_died_result(task.source))
                 yield index, _record_result(call, task, ended, known)
-
-
-def _take_tasks(turn: Iterable[Item], taken: list[Item]) -> Iterator[IngestTask]:
-    for item in turn:
-        taken.append(item)
-        yield item[1]
 
 
 def _record_result(call: RunningCall, task: IngestTask, ended: Ingested, known: set[str]) -> IngestResult:

@@ -20,8 +20,7 @@ from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.logs.log_joining import AnyLog, JoinedLog, open_logs
 from tcpipe.formats.parquet import add_segments_metadata, return_freed_memory, write_table
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, make_recipe_id, read_key
-from tcpipe.formats.runs import Counts, LogOrigin, Recording, Run, RunFacts, TopicCount, list_physics_terms
-from tcpipe.formats.store_records import Tags
+from tcpipe.formats.runs import Counts, LogOrigin, Recording, Run, RunFacts, Tags, TopicCount, list_physics_terms
 from tcpipe.formats.stored_runs import (
     STREAMS,
     convert_run_errors,
@@ -36,8 +35,7 @@ from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_resul
 from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
 from tcpipe.store import Store, name_run
-from tcpipe.tables.arrays import encode_rows, number_column
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import encode_rows, number_column, to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -233,7 +231,6 @@ def make_run(
         info=info,
         topics=tuple(TopicCount(topic.name, topic.type_name, topic.message_count) for topic in log.topics.values()),
         notes=read.notes,
-        read_report=streams.report,
     )
 
 

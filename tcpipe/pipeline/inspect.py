@@ -11,22 +11,19 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError
 from tcpipe.formats.atomic import make_scratch_directory
-from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.logs.log_file import list_logs_below
 from tcpipe.formats.logs.log_joining import open_single_log
-from tcpipe.formats.logs.log_names import is_log_file
-from tcpipe.formats.logs.table_folders import find_table_logs, is_table, list_table_files
+from tcpipe.formats.logs.table_folders import find_table_logs, is_log_file, is_table, list_table_files
 from tcpipe.formats.object_storage import format_path, is_presigned, is_url
-from tcpipe.formats.published_outputs import CARDS, find_newest
+from tcpipe.formats.published_outputs import CARDS, fetch_directory_by_range, find_newest
 from tcpipe.formats.runs import Counts, LogOrigin, RunFacts
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import find_remote_logs
-from tcpipe.pipeline.named_runs import find_named_runs, is_path
 from tcpipe.pipeline.proposals import propose_tables
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store, is_store
+from tcpipe.store import Store, find_named_runs, is_path, is_store
 from tcpipe.tables.findings import AFFECTED, Finding, Grade, Verdict
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 

@@ -44,9 +44,6 @@ class StampCounts:
 
     messages_read: int
     longest_gap_s: float | None
-    longest_gap_at_ns: int | None
-    """Log time before it."""
-    median_period_s: float | None
     gaps: int
     """Where log time and header agree that nothing came."""
     zero_stamps: int | None = None
@@ -95,8 +92,6 @@ class InspectedLog:
     robot: str | None = field(default=None, metadata=ABSENT)
     robot_why: str | None = field(default=None, metadata=ABSENT)
     topics: tuple[InspectedTopic, ...] | None = field(default=None, metadata=ABSENT)
-    clock_epochs: int | None = field(default=None, metadata=ABSENT)
-    """With everything read: stretches of the log between clock steps."""
     clock_steps: tuple[ClockStep, ...] | None = field(default=None, metadata=ABSENT)
     problems: tuple[str, ...] = ()
     """What is to be decided before it can be ingested, or why it cannot be read."""
@@ -146,7 +141,6 @@ def inspect_log(
         robot=cast.robot,
         robot_why=cast.robot_why,
         topics=topics,
-        clock_epochs=None if steps is None else len(steps) + 1,
         clock_steps=steps,
         problems=lost or tuple(cast.problems),
         findings=tuple(sort_findings(findings)),
@@ -279,7 +273,7 @@ class TopicStamps:
         """Return what they show."""
         log_ns, header_ns, same = self._joined()
         steps, odd = np.diff(log_ns), dict[str, int]()
-        period_ns = float(np.median(steps)) if len(steps) else None
+        period_ns = float(np.median(steps)) if len(steps) else 0.0
         if header_ns is not None:
             steps = np.minimum(steps, np.where(header_ns[1:] != 0, np.diff(header_ns), steps))
             again = (np.diff(header_ns) == 0) & (header_ns[1:] != 0)
@@ -289,13 +283,10 @@ class TopicStamps:
                 "repeated_stamps": int(np.count_nonzero(again & ~same[1:])),
                 "duplicates": int(np.count_nonzero(same)),
             }
-        longest = int(np.argmax(steps)) if len(steps) else 0
         return StampCounts(
             messages_read=len(log_ns),
-            longest_gap_s=max(int(steps[longest]), 0) / 1e9 if len(steps) else None,
-            longest_gap_at_ns=(int(log_ns[longest]) if steps[longest] > 0 else 0) if len(steps) else None,
-            median_period_s=None if period_ns is None else period_ns / 1e9,
-            gaps=int(np.count_nonzero(steps > max(_GAP_PERIODS * (period_ns or 0), _GAP_NS))),
+            longest_gap_s=max(int(steps.max()), 0) / 1e9 if len(steps) else None,
+            gaps=int(np.count_nonzero(steps > max(_GAP_PERIODS * period_ns, _GAP_NS))),
             **odd,
         )
 

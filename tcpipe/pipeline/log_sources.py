@@ -7,21 +7,25 @@ import os
 import shlex
 import sqlite3
 import stat
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from tcpipe.errors import LogError, StoreError, TcpipeError, clean_line
+from tcpipe.errors import LogError, StoreError, clean_line
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.log_file import find_logs, list_logs_below
-from tcpipe.formats.logs.log_joining import open_logs
-from tcpipe.formats.logs.log_names import find_log_suffix, is_log_file
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
-from tcpipe.formats.logs.table_folders import Mappings, find_table_logs, is_table, list_table_files, walk_folders
+from tcpipe.formats.logs.table_folders import (
+    Mappings,
+    find_log_suffix,
+    find_table_logs,
+    is_log_file,
+    is_table,
+    list_table_files,
+    walk_folders,
+)
 from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
-from tcpipe.formats.store_records import LogSnapshot
+from tcpipe.formats.runs import LogSnapshot
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -134,7 +138,6 @@ def find_sources(
     urls: dict[Path, str] = {}
     queries: dict[Path, str] = {}
     problems: dict[str, tuple[str, ...]] = {}
-    folders: dict[str, str] = {}
     transient = False
     for number, entry in enumerate(logs):
         try:
@@ -150,7 +153,7 @@ def find_sources(
                 above = Path(entry)
                 for files in find_logs_at(above, tables or {}):
                     found = [(_as_named(path), _place_in(path, above)) for path in files]
-                    paths.setdefault(_resolve_path(files[0], folders), found)
+                    paths.setdefault(os.path.realpath(files[0]), found)
         except LogError as error:
             problems[format_path(entry)] = error.problems
             transient |= is_transient(error)
@@ -224,75 +227,24 @@ def find_remote_logs(url: str, directory: Path) -> dict[Path, str]:
     """Return stand-ins for the logs at or below a URL, and the URL of each."""
     directory.mkdir(parents=True)
     place = make_stand_ins(url, directory, wanted=is_log_file)
-    folders: dict[str, str] = {}
     return {
-        Path(_resolve_path(path, folders)): "/".join((format_path(url).rstrip("/"), *path.relative_to(place).parts))
+        path.resolve(): "/".join((format_path(url).rstrip("/"), *path.relative_to(place).parts))
         for path in find_logs(place)
     }
 
 
-def add_hashes(group: Sequence[LogSource]) -> list[LogSource]:
-    """Return the logs of one of `group_possible_duplicates` with their hashes, which a log alone does not need."""
-    return [source if source.sha256 or len(group) == 1 else _hash_source(source) for source in group]
-
-
-def group_possible_duplicates(sources: Sequence[LogSource]) -> list[list[int]]:
-    """Return the indices of logs in groups that may be the same recording: logs of one size with the same bytes at the end."""
-    groups, sizes = dict[tuple[int, bytes] | int, list[int]](), Counter(source.size_bytes for source in sources)
-    for index, source in enumerate(sources):
-        end = _read_end(source) if sizes[source.size_bytes] > 1 else None
-        groups.setdefault(index if end is None else (source.size_bytes, end), []).append(index)
-    return [*groups.values()]
-
-
-_END_BYTES = 4096
-
-
-def _read_end(source: LogSource) -> bytes | None:
-    """Return the last bytes of a log's largest file, where indexes and checksums are; None where that cannot be read from here."""
-    parts = [] if source.urls else [file for path in source.paths for file in (path, *path.rglob("*"))]
-    with suppress(OSError, ValueError):  # none is a file
-        size_bytes, largest = max((file.stat().st_size, file) for file in parts if file.is_file())
-        with largest.open("rb") as stream:
-            stream.seek(max(size_bytes - _END_BYTES, 0))
-            return stream.read()
-    return None
-
-
-def plan_rounds(sources: Sequence[LogSource]) -> list[list[int]]:
-    """Return the indices of what can be ingested side by side, and then of what holds the same recording as one of those."""
-    seen: set[str] = set()
-    turns: list[list[int]] = [[], []]
-    for index, source in enumerate(sources):
-        turns[source.sha256 in seen].append(index)
-        seen |= {source.sha256} if source.sha256 else set()
-    return turns
-
-
-def _resolve_path(path: Path, folders: dict[str, str]) -> str:
-    """Return where a log really lies; a link that leads nowhere is where it is. ``folders`` keeps where folders lie."""
-    folder, name = os.path.split(path)  # of thousands: no Path for each
-    if name in ("", "..") or os.path.islink(path):  # noqa: PTH114
-        return str(path.resolve() if path.exists() else path.absolute())
-    if folder not in folders:
-        folders[folder] = str(path.parent.resolve())
-    return f"{folders[folder].rstrip('/')}/{name}"
-
-
 def _as_named(path: Path) -> Path:
     """Return a log's path in full, as the user names it; what lies above a ``..`` may be a link, and is followed."""
-    if ".." not in str(path):  # of thousands: no parts of each
+    if ".." not in path.parts:
         return path.absolute()
-    if path.name == "..":
-        return path.resolve()
-    return path.parent.resolve() / path.name if ".." in path.parts else path.absolute()
+    return path.resolve() if path.name == ".." else path.parent.resolve() / path.name
 
 
 def _place_in(path: Path, entry: Path) -> str:
-    text, above = str(path), str(entry)  # of thousands: no parts of each
-    if text == above:
+    """Return where a log lies in what the user gave; tables of a run may lie beside its first one."""
+    if path == entry:
         return path.name or path.resolve().name
-    return text.removeprefix(f"{above}/").lstrip("/")
+    return str(path).removeprefix(f"{entry}/").lstrip("/")
 
 
 def _list_file_states(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
@@ -316,16 +268,6 @@ def recall_hash(source: LogSource, seen: LogSnapshot | None) -> LogSource:
     dated = bool(source.files) and all(time_ns for _, time_ns in source.files)  # not every server tells the time
     is_same = dated and seen is not None and seen.size_and_time == source.files
     return replace(source, sha256=seen.sha256) if is_same and seen is not None else source
-
-
-def _hash_source(source: LogSource) -> LogSource:
-    if source.urls:  # it is hashed when it is read
-        return source
-    try:
-        with open_logs(source.paths) as log:
-            return replace(source, sha256=log.sha256())
-    except (TcpipeError, OSError):  # told when it is ingested
-        return source
 
 
 def find_damaged_log(damage: Sequence[Finding], subject: Subject) -> tuple[Finding, ...]:

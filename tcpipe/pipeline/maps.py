@@ -20,15 +20,14 @@ from tcpipe.formats.maps.geotiff import list_raster_files
 from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, map_lines
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
-from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.runs import StoredMap
 from tcpipe.pipeline.calls import ADD_MAP, RunningCall, record_call
 from tcpipe.pipeline.options import AddMapOptions, Files
 from tcpipe.report.pictures import draw_quick_look, write_overview
 from tcpipe.store import Store, check_map_name, open_store
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.tables.options import as_function
-from tcpipe.terrain.classes import ClassScheme
-from tcpipe.terrain.layers import find_wrong_name
+from tcpipe.terrain.layers import ClassScheme, find_wrong_name
 
 logger = logging.getLogger("tcpipe")
 

@@ -23,9 +23,9 @@ from tcpipe.formats.parquet import read_table
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
-from tcpipe.pipeline.named_runs import find_named_run
-from tcpipe.tables.arrays import make_text_column, to_numbers, to_texts
+from tcpipe.store import find_named_run
 from tcpipe.tables.bits import DropReason, Quality, flag_names
+from tcpipe.tables.columns import make_text_column, to_numbers, to_texts
 from tcpipe.tables.levels import GEOMETRY
 
 GEOJSON = "foxglove_msgs/msg/GeoJSON"
@@ -108,7 +108,11 @@ def _iterate_streams(run: StoredRun) -> Iterator[MessageStream]:
             yield MessageStream(
                 f"{OVERLAY}segments", GEOJSON, times[:1], {}, {"geojson": geojson}, definition="string geojson\n"
             )
-    yield _make_poses(rows, times)
+    columns = _make_header(_read_column(rows, "stamp_ns"))
+    columns |= {f"pose.position.{axis}": _read_column(rows, f"{axis}_m") for axis in "xyz"}
+    quat = quat_from_rpy(*(_read_column(rows, f"{name}_rad") for name in ("roll", "pitch", "yaw")))
+    columns |= {f"pose.orientation.{axis}": quat[:, at] for at, axis in enumerate("xyzw")}
+    yield MessageStream(f"{OVERLAY}pose", POSE_STAMPED, times, columns, {"header.frame_id": _FRAME})
     yield from _iterate_messages("track", "stamp_ns", rows, times)
     yield from _iterate_masks(to_texts(rows.column("reasons")), times)
     yield from _iterate_messages(
@@ -181,14 +185,6 @@ def _make_fixes(rows: pa.Table, times: Ints) -> MessageStream:
     covariance[:, ::4] = np.stack([_read_column(rows, f"{axis}_std_m") for axis in "xyz"], axis=-1) ** 2
     constants = {"header.frame_id": "base_link", "position_covariance_type": _DIAGONAL_KNOWN}
     return MessageStream(f"{OVERLAY}fix", NAV_SAT_FIX, times, columns | {"position_covariance": covariance}, constants)
-
-
-def _make_poses(rows: pa.Table, times: Ints) -> MessageStream:
-    columns = _make_header(_read_column(rows, "stamp_ns"))
-    columns |= {f"pose.position.{axis}": _read_column(rows, f"{axis}_m") for axis in "xyz"}
-    quat = quat_from_rpy(*(_read_column(rows, f"{name}_rad") for name in ("roll", "pitch", "yaw")))
-    columns |= {f"pose.orientation.{axis}": quat[:, at] for at, axis in enumerate("xyzw")}
-    return MessageStream(f"{OVERLAY}pose", POSE_STAMPED, times, columns, {"header.frame_id": _FRAME})
 
 
 def _iterate_masks(reasons: NDArray[np.str_], times: Ints) -> Iterator[MessageStream]:

@@ -16,8 +16,7 @@ from tcpipe.errors import TcpipeError, clean_line, hide_secrets
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.runs import RunFacts, find_problems
-from tcpipe.formats.store_records import Call, Failure, make_failure
+from tcpipe.formats.runs import Call, Failure, RunFacts, find_problems, make_failure
 from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient, recall_hash
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import Finding, Verdict, select_problems

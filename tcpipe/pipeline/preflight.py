@@ -228,12 +228,12 @@ def _compute_hourly_std(start_ns: NDArray[np.int64], span_s: float) -> float | N
 
 
 def _iterate_topics(facts: StageFacts, span_s: float) -> Iterator[RoleTopic]:
-    for role, role_facts in facts.roles.items():
+    for role, topics in facts.roles.items():
         shares = {
             name: topic.rows / (topic.rate_hz * span_s) if topic.rate_hz and span_s else 1.0
-            for name, topic in role_facts.topics.items()
+            for name, topic in topics.items()
         }
-        for name, topic in role_facts.topics.items():
+        for name, topic in topics.items():
             share = shares[name] if role == "power" else sum(shares.values())  # others follow each other
             yield RoleTopic(role, name, topic.rate_hz, WANTED_HZ.get(role), min(share, 1.0))
 

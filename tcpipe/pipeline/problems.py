@@ -9,8 +9,7 @@ from pathlib import Path
 from tcpipe.errors import UsageError, list_first
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
-from tcpipe.formats.runs import Run, RunFacts, find_problems
-from tcpipe.formats.store_records import Call, Problem, make_failure
+from tcpipe.formats.runs import Call, Problem, Run, RunFacts, find_problems, make_failure
 from tcpipe.pipeline.calls import ACKNOWLEDGE, BUILD, INGEST, close_call, list_open_calls, record_call
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.store import Store, open_store

@@ -17,11 +17,11 @@ from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
 from tcpipe.formats.dataset_files import CARD, parse_card
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.object_storage import make_absolute
-from tcpipe.formats.payload import find_unnamed, list_named_files, list_payload, read_records
 from tcpipe.formats.place import Entry
 from tcpipe.formats.published_outputs import find_newest
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Run, RunFacts
+from tcpipe.formats.stored_runs import find_unnamed, list_named_files, list_payload, read_records
 from tcpipe.pipeline.calls import PRUNE, OpenCall, format_bytes, is_alive, list_open_calls, record_call
 from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import Recipe

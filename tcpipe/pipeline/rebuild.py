@@ -13,18 +13,16 @@ from tcpipe import __version__
 from tcpipe.errors import DatasetError, LogError, TcpipeError, UsageError, clean_line
 from tcpipe.execution import refuse_import_of_script
 from tcpipe.formats.atomic import check_input_directory, check_output_directory, make_scratch_directory
-from tcpipe.formats.bucket_directories import fetch_directory
-from tcpipe.formats.dataset_card import DatasetCard, MapSource
+from tcpipe.formats.dataset_card import DatasetCard, DatasetInputs, MapSource, RunInputs
 from tcpipe.formats.dataset_files import CARD, read_card
-from tcpipe.formats.dataset_inputs import DatasetInputs, RunInputs
-from tcpipe.formats.file_checks import find_wrong_files
 from tcpipe.formats.geojson import Feature, FeatureCollection
 from tcpipe.formats.integrity import Checksum, compute_checksum
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.table_folders import Mappings, is_table, walk_folders
 from tcpipe.formats.maps.map_facts import MapInputs
-from tcpipe.formats.place import Place
+from tcpipe.formats.place import Place, find_wrong_files
+from tcpipe.formats.published_outputs import fetch_directory
 from tcpipe.formats.recipe_toml import make_recipe_id
 from tcpipe.pipeline.dataset.build import run_build_dataset
 from tcpipe.pipeline.diff import diff, list_causes

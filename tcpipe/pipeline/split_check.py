@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,11 @@ from tcpipe.formats.atomic import write_text
 from tcpipe.formats.covariates import read_rows
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.pipeline.options import CheckSplitOptions
-from tcpipe.report.split_page import render_split_page
+from tcpipe.report.colours import CLASS_COLOURS, CURSOR, SPLIT_COLOURS
+from tcpipe.report.page import Section, render_page
+from tcpipe.report.plots import make_map_plot
 from tcpipe.splits.audit import count_neighbours, measure_leakage
-from tcpipe.tables.arrays import to_numbers, to_texts
-from tcpipe.tables.columns import to_floats
+from tcpipe.tables.columns import to_floats, to_numbers, to_texts
 from tcpipe.tables.options import as_function
 
 Floats = NDArray[np.float64]
@@ -259,3 +260,27 @@ def _read_positions(path: Path, table: pa.Table, xy: Sequence[str], is_used: Mas
         text = f"samples are up to {apart_m / 1e3:.0f} km from the first one; expected at most {_MOST_APART_M / 1e3:.0f} km"
         raise DatasetError(f"{path}: {text} for longitude and latitude; judge a table for each region")
     return [end[:, :2] for end in ends_m]
+
+
+_MOST_POINTS = 50_000
+"""On the map: of more, equally spaced ones."""
+
+
+def render_split_page(
+    lines: Sequence[str], rows: Sequence[Sequence[str]], places_m: Mapping[str, NDArray[np.float64]]
+) -> str:
+    """Return the HTML page: ``lines`` of text, the table ``rows``, head first, and a map of ``places_m``.
+
+    These are the positions [m], (N, 2), of each split by its name, and at last those of the samples that leak.
+    """
+    others = iter(CLASS_COLOURS[1:] * len(places_m))
+    colours = {name: SPLIT_COLOURS.get(name) or next(others) for name in places_m} | {"leaking samples": CURSOR}
+    alt = "Map of the samples by split; the table below lists the counts."
+    plot = replace(make_map_plot(alt=alt, axes=("x [m]", "y [m]"), height_px=420), legend=colours)
+    every = -(-sum(map(len, places_m.values())) // _MOST_POINTS)
+    for name, xy_m in places_m.items():
+        look = {"size": 9, "fill_alpha": 0.0} if name == "leaking samples" else {"size": 5}
+        plot.figure.scatter(*xy_m[::every].T, color=colours[name], **look)
+    parts = [Section("Held-out splits", "Distances are between footprints.", header=rows[0], rows=rows[1:])]
+    sections = [Section("Map", f"One of {every} samples." if every > 1 else "", plots=[plot]), *parts]
+    return render_page(title="Check of a split", lead=lines[0], numbers=[], warnings=lines[1:], sections=sections)

@@ -19,7 +19,7 @@ from tcpipe.formats.documents import State
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_finding, group_findings
 from tcpipe.formats.object_storage import format_path, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
-from tcpipe.formats.store_records import Call, Problem
+from tcpipe.formats.runs import Call, Problem
 from tcpipe.pipeline.calls import (
     INGEST,
     Estimate,
@@ -30,8 +30,7 @@ from tcpipe.pipeline.calls import (
     list_ended_calls,
     list_open_calls,
 )
-from tcpipe.pipeline.ingest import CallOptions
-from tcpipe.pipeline.log_queue import make_tasks
+from tcpipe.pipeline.ingest import CallOptions, make_tasks
 from tcpipe.pipeline.log_sources import find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, Step, plan

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, find_leftovers, is_abandoned
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import CARD, REPORT, SAMPLES, find_foreign_files, is_desktop_file, parse_card
+from tcpipe.formats.dataset_files import CARD, SAMPLES, find_foreign_files, parse_card
 from tcpipe.formats.documents import (
     BLOBS,
     INDEX,
@@ -22,19 +22,17 @@ from tcpipe.formats.documents import (
     parse_name,
     read_record,
 )
-from tcpipe.formats.file_checks import find_wrong_files
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_column_names, read_row_count
-from tcpipe.formats.payload import BLOB, find_unnamed, list_named_files, list_payload, read_records
-from tcpipe.formats.place import Place, open_place
+from tcpipe.formats.place import REPORT, Place, find_wrong_files, is_desktop_file, open_place
 from tcpipe.formats.published_outputs import CARDS, FoundCard, find_newest, find_unlisted_files
 from tcpipe.formats.runs import Run, RunFacts
+from tcpipe.formats.stored_runs import BLOB, find_unnamed, list_named_files, list_payload, read_records
 from tcpipe.pipeline.calls import list_open_calls
-from tcpipe.pipeline.named_runs import find_named_runs
 from tcpipe.pipeline.problems import find_incomplete_runs
-from tcpipe.store import Store, is_store
+from tcpipe.store import Store, find_named_runs, is_store
 from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.tables.levels import COORDINATES, DATA_MODEL_VERSION
 

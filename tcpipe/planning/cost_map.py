@@ -29,16 +29,14 @@ from numpy.typing import NDArray
 from tcpipe.cost.prediction_errors import Errors
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
-from tcpipe.formats.bucket_directories import fetch_directory
-from tcpipe.formats.file_checks import find_wrong_files
 from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, make_raster_style, write_nav2_map
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.place import Place
-from tcpipe.formats.published_outputs import find_newest, write_output
+from tcpipe.formats.place import Place, find_wrong_files
+from tcpipe.formats.published_outputs import fetch_directory, find_newest, write_output
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_grid import (
     ANGLES_DEG,

@@ -21,8 +21,7 @@ from tcpipe.errors import ModelError
 from tcpipe.learning.models import Model
 from tcpipe.learning.predictor import Prediction
 from tcpipe.tables.bits import flag_name
-from tcpipe.terrain.classes import NODATA_ID
-from tcpipe.terrain.layers import COLOURS, HEIGHT_STEP_M, LAYERS, PAPER_LAYERS
+from tcpipe.terrain.layers import COLOURS, HEIGHT_STEP_M, LAYERS, NODATA_ID, PAPER_LAYERS
 from tcpipe.terrain.sampling import (
     Patches,
     PatchFrames,

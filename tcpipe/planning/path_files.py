@@ -15,12 +15,12 @@ from tcpipe.cost.adaptation import Run
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.errors import MapError, ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside
-from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature, read_line
 from tcpipe.formats.integrity import compute_checksum, describe_broken, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import convert_record, digest, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.published_outputs import fetch_directory
 from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_grid import make_survey

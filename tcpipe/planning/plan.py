@@ -37,7 +37,7 @@ from tcpipe.planning.search import (
     straighten_path,
 )
 from tcpipe.tables.bits import flag_names
-from tcpipe.terrain.classes import NODATA_ID
+from tcpipe.terrain.layers import NODATA_ID
 from tcpipe.terrain.sampling import find_classes_at
 
 logger = logging.getLogger("tcpipe")

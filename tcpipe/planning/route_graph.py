@@ -17,7 +17,7 @@ from tcpipe.errors import PathError, UsageError, clean_lines
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.json_files import Json, write_json
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.route_graph import RouteEdge, RouteGraph, make_route_graph, read_route_graph
+from tcpipe.formats.maps.nav2 import RouteEdge, RouteGraph, make_route_graph, read_route_graph
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_model import check_model
 from tcpipe.planning.path_cost import PathCost, compute_path_cost, find_origin_m, find_projection

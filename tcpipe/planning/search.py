@@ -30,7 +30,7 @@ from tcpipe.compiled import compile_kernel
 from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.planning.cost_grid import ANGLES_DEG, COURSES, MOVES, CostGrid, find_crossed_cells
 from tcpipe.tables.facts import PhysicsFit
-from tcpipe.terrain.classes import ClassTable
+from tcpipe.terrain.layers import ClassTable
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

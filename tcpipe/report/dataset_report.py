@@ -20,8 +20,8 @@ from tcpipe.formats.dataset_files import read_intact_card, read_samples, sample_
 from tcpipe.formats.documents import BLOBS
 from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
+from tcpipe.formats.place import REPORT
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, find_class_colour
-from tcpipe.report.dataset_patches import PER_SHEET, make_patches_data
 from tcpipe.report.label_sections import (
     LABELS,
     QUALITY_WORDS,
@@ -37,19 +37,18 @@ from tcpipe.report.page import (
     Link,
     Number,
     Section,
-    VerdictBox,
     make_shown_column,
     pack_columns,
     render_page,
     show_verdict,
 )
+from tcpipe.report.pictures import PER_SHEET, make_patches_data
 from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.stages.sample import separate_frames
 from tcpipe.store import Store, is_store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
-_PAGE = "report.html"
 MOST_SAMPLES = 100_000
 """On the page: of more the first ones, since their order is random."""
 
@@ -78,7 +77,7 @@ def render_dataset_report(
     """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model.
 
     ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too. ``folder`` beside the page
-    holds pictures of all patches (`tcpipe.report.dataset_patches.iterate_pictures`), if it is given. ``samples`` has at least
+    holds pictures of all patches (`tcpipe.report.pictures.iterate_pictures`), if it is given. ``samples`` has at least
     `SAMPLE_COLUMNS` of the samples; None: they are read.
     Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
     """
@@ -95,10 +94,11 @@ def render_dataset_report(
         patches, lost = None, [*lost, f"no patches are shown: {error.problems[0]}"]
     waterfall = draw_waterfall(card.distance_by_reason_m)
     hrefs = {} if beside is None else _find_run_pages(beside, card)
+    groups = group_dataset_findings(card.findings, card.findings_by_run, card.findings_by_map)
     return render_page(
         title=f"Dataset {card.name}",
         lead=card.description or f"{card.format} format, data model {card.data_model_version}",
-        verdict=_make_verdict(card),
+        verdict=show_verdict(judge_dataset(card.findings, card.runs, card.maps), groups=groups),
         numbers=_make_numbers(card),
         links=[] if beside is None else _list_store_pages(beside, hrefs),
         warnings=lost,
@@ -128,12 +128,6 @@ def render_dataset_report(
         data=_make_data(card, samples, shown, patches=patches, map_plot=plots[0], hrefs=hrefs) | {"folder": folder},
         reads_pictures=bool(folder),
     )
-
-
-def _make_verdict(card: DatasetCard) -> VerdictBox:
-    """Return the verdict and the findings by code."""
-    groups = group_dataset_findings(card.findings, card.findings_by_run, card.findings_by_map)
-    return show_verdict(judge_dataset(card.findings, card.runs, card.maps), groups=groups)
 
 
 _SELECTION = Section(
@@ -202,14 +196,14 @@ def _find_run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
         with suppress(StoreError, UsageError):  # no store that can be read
             rows = Store(path).scan().runs.values() if is_store(path) else ()
             names = {row.run_id: row.blob for row in rows if row.blob and (row.run_id, row.recipe_id) in wanted}
-            found |= {run_id: f"../{path.name}/{BLOBS}/{blob}/{_PAGE}" for run_id, blob in names.items()}
+            found |= {run_id: f"../{path.name}/{BLOBS}/{blob}/{REPORT}" for run_id, blob in names.items()}
     return found
 
 
 def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
     """Return the existing pages of the stores of these runs' pages (`_find_run_pages`)."""
     stores = sorted({href.split("/")[1] for href in hrefs.values()})
-    return [Link(f"All runs of {name}", f"../{name}/{_PAGE}") for name in stores if (beside / name / _PAGE).is_file()]
+    return [Link(f"All runs of {name}", f"../{name}/{REPORT}") for name in stores if (beside / name / REPORT).is_file()]
 
 
 def _make_audit_section(card: DatasetCard) -> Section:

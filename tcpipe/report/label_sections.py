@@ -156,7 +156,7 @@ def make_repeatability_section(repeatability: Mapping[str, Floor | None]) -> Sec
         if entry is not None:
             ends = (entry.std_low, entry.std_high)
             interval = "too few places" if None in ends else f"{ends[0]:.3g} to {ends[1]:.3g}"
-            rows.append((_name(label), f"{entry.std:.3g} {unit}", interval, entry.pairs, entry.places,
+            rows.append((label.rsplit("_", 1)[0].replace("_", " "), f"{entry.std:.3g} {unit}", interval, entry.pairs, entry.places,
                          f"{100 * (1 - min(entry.share_of_variance, 1.0)):.1f} %"))  # fmt: skip
     text = (
         "Places that were driven twice in the same direction: this variation limits the accuracy of every model."
@@ -165,7 +165,3 @@ def make_repeatability_section(repeatability: Mapping[str, Floor | None]) -> Sec
     )
     header = ("label", "repeatability (σ)", "95 % interval", "pairs", "places", "variance to explain")
     return Section("Repeatability: lower bound of model errors", text, header=header if rows else (), rows=rows)
-
-
-def _name(label: str) -> str:
-    return label.rsplit("_", 1)[0].replace("_", " ")

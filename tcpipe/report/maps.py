@@ -15,7 +15,7 @@ from tcpipe.errors import TcpipeError, clean_line
 from tcpipe.formats.dataset_card import LOCAL, DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, OVERVIEW, RELIEF
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.runs import StoredMap
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.report.colours import CURSOR, FAINT, SPLIT_COLOURS
 from tcpipe.report.pictures import (

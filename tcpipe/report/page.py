@@ -43,7 +43,6 @@ from tcpipe.formats.finding_lines import (
     describe_finding,
     describe_group,
     describe_label,
-    describe_title,
     list_remedies,
 )
 from tcpipe.formats.json_files import Json
@@ -57,6 +56,7 @@ from tcpipe.tables.findings import (
     Grade,
     Severity,
     Verdict,
+    find_entry,
     sort_findings,
 )
 
@@ -139,9 +139,9 @@ def show_verdict(
     shown = []
     for (severity, code), of_code in by_code.items():
         observed = [(describe_finding(finding), finding.span_s) for finding in of_code]
-        shown.append(ShownFinding(severity, code, describe_title(of_code[0]), observed, list_remedies(of_code)))
+        shown.append(ShownFinding(severity, code, find_entry(code).title, observed, list_remedies(of_code)))
     for group, total, noun in groups:
-        title, text = describe_title(group.findings[0]), describe_group(group, total, noun)
+        title, text = find_entry(group.code).title, describe_group(group, total, noun)
         shown.append(ShownFinding(group.severity, group.code, title, [(text, None)], list_remedies(group.findings)))
     problems = [line for severity in ("error", "warning") for line in shown if line.severity == severity]
     return VerdictBox(

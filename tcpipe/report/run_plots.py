@@ -16,9 +16,8 @@ from tcpipe.power.rails import is_power_only
 from tcpipe.report.colours import DROPPED, KEPT, LINE_COLOURS, REASON_COLOURS, SEVERITY_COLOURS
 from tcpipe.report.page import Column, make_shown_column, pack_columns
 from tcpipe.report.plots import Plot, add_cursor, make_plot, show_text
-from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.bits import DropReason, flag_name
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import to_floats, to_integers, to_texts
 from tcpipe.tables.facts import StageFacts
 from tcpipe.tables.findings import Finding
 

@@ -15,6 +15,7 @@ from tcpipe.errors import StoreError, TableError
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
+from tcpipe.formats.place import REPORT
 from tcpipe.formats.runs import Run
 from tcpipe.formats.stored_runs import StoredRun, find_stream_files
 from tcpipe.report.colours import DOUBTED, KEPT, LINE_COLOURS, SEVERITY_COLOURS, UNUSED
@@ -51,7 +52,6 @@ from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import NoiseFacts, PhysicsFacts, StageFacts
 from tcpipe.tables.findings import SEVERITIES, Finding, rank_severity, read_catalogue
 
-_PAGE = "report.html"
 _NOISE = (
     "Noise of the sensors: how much the error of each changes over a time difference (1σ).\n"
     "Line: fitted to the longest section of the run; dashed: by the "
@@ -89,7 +89,7 @@ def run_report(run: StoredRun, maps: StoredMaps, *, made_from: str = "") -> str:
             Number(_mean(segments, "power_watt", "W"), "mean power w"),
             Number(_mean(segments, "velocity_mps", "m/s", digits=2), "mean velocity v"),
         ],
-        links=[Link("All runs of the store", f"../../{_PAGE}")] if run.place.size(_PAGE) is not None else [],
+        links=[Link("All runs of the store", f"../../{REPORT}")] if run.place.size(REPORT) is not None else [],
         sections=[
             *drive.sections,
             *make_losses_sections([ledger], "Kept and excluded distances add up to the odometer.", names_runs=False),

@@ -24,8 +24,7 @@ from tcpipe.simulation.scenarios import find_scenario as scenario_by_name
 from tcpipe.simulation.sensors import Noise, Reading, record
 from tcpipe.simulation.truth import Truth
 from tcpipe.simulation.world import World
-from tcpipe.terrain.classes import PAPER_CLASSES
-from tcpipe.terrain.layers import Pixels
+from tcpipe.terrain.layers import PAPER_CLASSES, Pixels
 from tcpipe.terrain.target_grid import MapGrid
 
 _HEIGHT_NODATA = -9999.0

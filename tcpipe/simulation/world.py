@@ -2,7 +2,7 @@
 
 Height is a sum of smooth hills and waves, classes are bands (roads) and ellipses (mud, trees, a pond) on grass, colour follows the class
 with soft borders and a band-limited texture. Every function takes map coordinates of any shapes that broadcast; hills are separable,
-so that a raster costs an outer product. Classes are the ids of `tcpipe.terrain.classes.PAPER_CLASSES`; the last four are traversable.
+so that a raster costs an outer product. Classes are the ids of `tcpipe.terrain.layers.PAPER_CLASSES`; the last four are traversable.
 """
 
 from __future__ import annotations

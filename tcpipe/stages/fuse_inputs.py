@@ -39,8 +39,7 @@ from tcpipe.fusion.preparation import Prepared
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.tables.arrays import select_rows
-from tcpipe.tables.columns import read_float_columns, to_floats, to_integers
+from tcpipe.tables.columns import read_float_columns, select_rows, to_floats, to_integers
 from tcpipe.tables.facts import ClockFacts, ClockOffset
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import Sensor, Streams

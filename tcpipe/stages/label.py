@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import pyarrow as pa
@@ -56,9 +57,8 @@ from tcpipe.stages.label_uncertainty import (
 )
 from tcpipe.stages.label_witnesses import find_witnesses
 from tcpipe.stages.message_arrays import make_rails
-from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
-from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
+from tcpipe.tables.columns import make_lines, read_lonlat_deg, select_rows, to_floats, to_integers, to_numbers
 from tcpipe.tables.facts import PhysicsFacts, PowerSensorFacts
 from tcpipe.tables.levels import (
     LABELLED_SEGMENTS,
@@ -144,7 +144,11 @@ def label_segments(
         table, rails_by_epoch, joules, distance_by_reason_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
     facts = replace(facts, power_sensor=None if facts.energy_joule is None else power)
-    findings = [*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns), *unpowered]
+    findings = [
+        *find_label_findings(facts, chain(*rails_by_epoch.values())),
+        *find_sensor_findings(facts, masked.info, start_ns),
+        *unpowered,
+    ]
     findings += find_witnesses(table, replace(masked.info.report.facts, label=facts), robot)
     kind, rails = masked.info.report.facts.power, next(iter(rails_by_epoch.values()), [])
     findings += find_negative_idle(standing, facts.median_power_watt, kind, rails)

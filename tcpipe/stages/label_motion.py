@@ -5,7 +5,7 @@ Facts and findings of labelling: the run's energy by entry, the noise floor, the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -28,12 +28,11 @@ from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.distance_breakdown import find_interval_reason, sum_by_reason
 from tcpipe.motion.row_sections import number_pieces
 from tcpipe.motion.vibration import compute_vibration_mps2
-from tcpipe.power.noise import compute_median_period_s, estimate_resolution
-from tcpipe.power.rails import Rail, Rule, Samples, integrate_recorded_energy
-from tcpipe.tables.arrays import select_rows, to_numbers
+from tcpipe.power.noise import compute_median_period_s
+from tcpipe.power.rails import Rail, Rule, integrate_recorded_energy
 from tcpipe.tables.bits import DropReason, Quality, flag_name
-from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts, RailFacts, SignalFacts
+from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_numbers
+from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo
 
@@ -239,7 +238,6 @@ def make_label_facts(
         energy_by_entry_joule=dict(energy_by_entry_joule) if powered else None,
         integration=rule,
         velocity=velocity,
-        rails={str(epoch): tuple(describe_rail(each) for each in rails[epoch]) for epoch in rails if rails[epoch]},
         segments=table.num_rows,
         segments_without_power=int(np.isnan(energy).sum()),
         median_power_watt=_compute_median(to_floats(table, "power_watt")),
@@ -265,11 +263,11 @@ def _make_budget(
     )
 
 
-def find_label_findings(facts: LabelFacts) -> tuple[Finding, ...]:
-    """Return what was observed while labelling."""
+def find_label_findings(facts: LabelFacts, rails: Iterable[Rail]) -> tuple[Finding, ...]:
+    """Return what was observed while labelling by all rails of a run."""
     findings = []
     if facts.quality["low_power_rate"] and facts.segments_without_power < facts.segments:
-        findings.append(_find_low_rate(facts))
+        findings.append(_find_low_rate(facts, rails))
     if facts.energy_joule is not None and facts.segments and facts.segments_without_power:
         lost, total = facts.segments_without_power, facts.segments
         findings.append(
@@ -287,13 +285,11 @@ def find_label_findings(facts: LabelFacts) -> tuple[Finding, ...]:
     return (*findings, *find_noise(facts.energy_budget, _POWER))
 
 
-def _find_low_rate(facts: LabelFacts) -> Finding:
+def _find_low_rate(facts: LabelFacts, rails: Iterable[Rail]) -> Finding:
     """Return the finding that the current, or else the voltage, is measured too slowly."""
-    rails = [rail for each in facts.rails.values() for rail in each]
-    current_hz, voltage_hz = (
-        min((each.rate_hz for each in signals if each.rate_hz), default=0.0)
-        for signals in ([rail.current for rail in rails], [rail.voltage for rail in rails])
-    )
+    signals = zip(*((each.current, each.voltage) for each in rails), strict=True)
+    periods_s = (filter(np.isfinite, map(compute_median_period_s, of_rails)) for of_rails in signals)
+    current_hz, voltage_hz = (1.0 / max(of_rails, default=np.inf) for of_rails in periods_s)
     wanted_hz = find_wanted_rate(averaged=facts.integration == "averaged")
     quantity, rate_hz = ("current", current_hz) if current_hz < wanted_hz else ("voltage", voltage_hz)
     return make_finding("power-too-slow", _POWER, names={"quantity": quantity}, rate_hz=rate_hz, wanted_hz=wanted_hz)
@@ -307,18 +303,6 @@ def _compute_share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDA
 def _compute_median(values: NDArray[np.float64]) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.median(np.abs(known))) if len(known) else None
-
-
-def describe_rail(each: Rail) -> RailFacts:
-    """Return counts, rates and resolutions of a rail's samples."""
-    return RailFacts(each.name, *(_describe_signal(signal) for signal in (each.voltage, each.current)))
-
-
-def _describe_signal(signal: Samples) -> SignalFacts:
-    period_s = compute_median_period_s(signal)
-    return SignalFacts(
-        len(signal.value), 1.0 / period_s if np.isfinite(period_s) else None, estimate_resolution(signal)
-    )
 
 
 def sum_energy_entries(rows: pa.Table, rails: list[Rail], *, rate_hz: float, rule: Rule) -> dict[str, float]:

@@ -35,9 +35,8 @@ from tcpipe.power.witnesses import estimate_missing_std_fraction
 from tcpipe.recipe import LabelConfig
 from tcpipe.recipe.suggestions import Keys, suggest
 from tcpipe.robots import GAIN_STD_FRACTION, OFFSET_STD_AMP
-from tcpipe.tables.arrays import select_rows, to_numbers
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_numbers
 from tcpipe.tables.facts import LabelFacts, PhysicsFacts, PowerSensorFacts, PowerSign, StageFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo

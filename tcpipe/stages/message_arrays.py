@@ -18,8 +18,7 @@ from tcpipe.logs.field_mapping import Array
 from tcpipe.logs.messages import LOG_TIME
 from tcpipe.logs.topics import Topic
 from tcpipe.power.rails import Rail, make_rail, make_samples
-from tcpipe.tables.arrays import select_rows, to_numbers, to_texts
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_numbers, to_texts
 from tcpipe.tables.levels import STREAMS, Streams
 
 T = TypeVar("T", bound=np.generic)

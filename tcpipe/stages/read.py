@@ -29,7 +29,7 @@ from tcpipe.stages.read_power import (
     remove_repeats,
 )
 from tcpipe.stages.read_sources import TopicReadings, place_pose, place_sensors, read_sources
-from tcpipe.tables.facts import RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
+from tcpipe.tables.facts import StageFacts, TopicClock, TopicFacts
 from tcpipe.tables.findings import Finding, Severity, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
@@ -218,8 +218,14 @@ def make_read_report(
         span_s, step_s = (at_s, at_s), step.step_s
         findings.append(make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s))
     facts = StageFacts(
-        robot=RobotChoice(assignment.robot, assignment.robot_why),
-        roles={role: _make_role_facts(role, assignment, sources, timelines, sensors[role]) for role in sensors},
+        roles={
+            role: {
+                source.topic: _make_topic_facts(source, timelines[source.key])
+                for source in sources
+                if source.role == role and source.key in timelines
+            }
+            for role in sensors
+        },
         left_out=assignment.left_out,
         epochs=len(steps) + 1,
         clock_steps=tuple(steps),
@@ -252,18 +258,6 @@ def _find_clock(source: TopicReadings, timeline: Timeline, *, is_simulated: bool
     for epoch, moved_s in enumerate(timeline.moved_s):
         if moved_s and not by_simulation:
             yield make_finding("topic-clock-offset", role, names=names, moved_s=moved_s, clock_epoch=epoch)
-
-
-def _make_role_facts(
-    role: str,
-    assignment: RoleAssignment,
-    sources: Sequence[TopicReadings],
-    timelines: Mapping[str, Timeline],
-    sensor: Sensor,
-) -> RoleFacts:
-    played = [source for source in sources if source.role == role and source.key in timelines]
-    topics = {source.topic: _make_topic_facts(source, timelines[source.key]) for source in played}
-    return RoleFacts(assignment.roles[role].why, sensor.frame_id, sensor.placed_by, topics)
 
 
 def _make_topic_facts(source: TopicReadings, timeline: Timeline) -> TopicFacts:

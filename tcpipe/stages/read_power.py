@@ -21,8 +21,7 @@ from tcpipe.power.witnesses import compute_side_share
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Profiles
-from tcpipe.tables.arrays import select_rows, to_texts
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_texts
 from tcpipe.tables.findings import Finding, Severity, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import STREAMS
 

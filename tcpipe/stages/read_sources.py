@@ -91,7 +91,12 @@ def read_sources(
         if role != "power":
             std_m = cast("dict[str, float]", config.fix_std_m)
             try:
-                readings = read_messages(columns, role, _find_type(topics[topic], role, config), fix_std_m=std_m)
+                readings = read_messages(
+                    columns,
+                    role,
+                    (MAPPED_TYPES[role] if role in config.fields else (topics[topic]).type_name),
+                    fix_std_m=std_m,
+                )
             except KeyError as error:
                 names = {"role": role, "fields": str(error.args[0])}
                 findings.append(make_finding("fields-missing", Subject("topic", topic), names=names))
@@ -174,10 +179,6 @@ def scale_odometry(readings: Readings, factor: float) -> Readings:
         if powers:
             columns[name] = values * factor ** max(powers)
     return replace(readings, columns=columns)
-
-
-def _find_type(topic: Topic, role: Role, config: ReadConfig) -> str:
-    return MAPPED_TYPES[role] if role in config.fields else topic.type_name
 
 
 def _read_fields(columns: Arrays, role: Role, config: ReadConfig) -> Arrays:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
@@ -23,12 +22,11 @@ from tcpipe.motion.distance_breakdown import (
 from tcpipe.motion.row_sections import number_pieces
 from tcpipe.path import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig
-from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import DropReason, Loss, flag_name
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import to_floats, to_integers, to_numbers
 from tcpipe.tables.facts import SegmentFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
-from tcpipe.tables.levels import SEGMENTS, Datum, MaskedTrack, Segments, TrackInfo, add_findings
+from tcpipe.tables.levels import SEGMENTS, MaskedTrack, Segments, TrackInfo, add_findings
 
 ENTRIES = ("kept", *(flag_name(bit) for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))
 """Names of the ledger's entries, in order."""
@@ -82,7 +80,12 @@ def _make_segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) ->
     }
     for end, position_m in (("start", start_m), ("end", end_m)):
         columns |= {f"{end}_{axis}_m": position_m[:, i] for i, axis in enumerate("xyz")}
-        columns |= _make_lon_lat(end, position_m, info.datum)
+        lon, lat = np.full((2, len(position_m)), np.nan)
+        if info.datum is not None:
+            lon, lat, _ = geodetic_from_enu(
+                position_m, datum_deg_m=(info.datum.lon_deg, info.datum.lat_deg, info.datum.alt_m)
+            )
+        columns |= {f"{end}_lon_deg": lon, f"{end}_lat_deg": lat}
     for name, source in (("fused", "forward"), ("commanded", "commanded")):
         signal = to_floats(rows, f"{source}_velocity_mps")
         columns[f"{name}_velocity_mps"] = mean_between(path.stamp_ns, signal, cut.start_ns, cut.end_ns)
@@ -91,14 +94,6 @@ def _make_segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) ->
     )  # DRMS: holds whatever way the error points
     ends_m = [interpolate(path.stamp_ns, std_m, at_ns) for at_ns in (cut.start_ns, cut.end_ns)]
     return SEGMENTS.table(**columns, position_std_m=np.maximum(*ends_m))
-
-
-def _make_lon_lat(end: str, position_m: NDArray[np.float64], datum: Datum | None) -> dict[str, NDArray[np.float64]]:
-    """Return longitude and latitude of one end; nowhere in a local frame."""
-    lon, lat = np.full((2, len(position_m)), np.nan)
-    if datum is not None:
-        lon, lat, _ = geodetic_from_enu(position_m, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m))
-    return {f"{end}_lon_deg": lon, f"{end}_lat_deg": lat}
 
 
 def _find_why_none(metres: dict[str, float], run_id: str) -> Finding:

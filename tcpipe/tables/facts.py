@@ -16,14 +16,6 @@ ABSENT: Mapping[str, tuple[object, ...]] = {"json": (None,)}
 
 
 @dataclass(frozen=True, slots=True)
-class RobotChoice:
-    """The robot profile in use, and why."""
-
-    name: str
-    why: str
-
-
-@dataclass(frozen=True, slots=True)
 class TopicClock:
     """Source of a topic's stamps and why, the median of header minus log time, and the correction of stamps by clock epoch [s]."""
 
@@ -44,16 +36,6 @@ class TopicFacts:
     dropped: Mapping[str, int]
     notes: Mapping[str, int]
     time: TopicClock
-
-
-@dataclass(frozen=True, slots=True)
-class RoleFacts:
-    """Why a role uses its topics, the frame of its sensor, and the source of its extrinsics."""
-
-    why: str
-    frame: str
-    placed_by: str
-    topics: Mapping[str, TopicFacts]
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,24 +279,6 @@ class SegmentFacts:
     duration_by_reason_s: Mapping[str, float]
 
 
-@dataclass(frozen=True, slots=True)
-class SignalFacts:
-    """Samples of a voltage [V] or a current [A], their rate and resolution."""
-
-    samples: int
-    rate_hz: float | None
-    resolution: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class RailFacts:
-    """Signals of one rail in one clock epoch."""
-
-    name: str
-    voltage: SignalFacts
-    current: SignalFacts
-
-
 CAUSES = ("position", "rate", "current", "voltage")
 """Displacement of both ends; the current between samples; noise and rounding of the current; those of the voltage."""
 
@@ -480,14 +444,13 @@ class PowerSensorFacts:
 
 @dataclass(frozen=True, slots=True)
 class LabelFacts:
-    """The run's energy by entry of the distance breakdown, its power rails by clock epoch, and uncertainty and flags of its labels."""
+    """The run's energy by entry of the distance breakdown, and uncertainty and flags of its labels."""
 
     distance_m: float
     energy_joule: float | None
     energy_by_entry_joule: Mapping[str, float] | None
     integration: str
     velocity: str
-    rails: Mapping[str, tuple[RailFacts, ...]]
     segments: int
     segments_without_power: int
     median_power_watt: float | None
@@ -502,8 +465,8 @@ class LabelFacts:
 class StageFacts:
     """The facts of a run: those of reading, and those of each later stage under its name."""
 
-    robot: RobotChoice | None = None
-    roles: Mapping[str, RoleFacts] = field(default_factory=dict)
+    roles: Mapping[str, Mapping[str, TopicFacts]] = field(default_factory=dict)
+    """The topics of each role."""
     left_out: Mapping[str, str] = field(default_factory=dict)
     """By unused topic that fits a role: why it is unused."""
     epochs: int = 1

@@ -98,6 +98,12 @@ def read_catalogue_version() -> str:
     return sha256(_read_text().encode()).hexdigest()[:8]
 
 
+def find_entry(code: str) -> Entry:
+    """Return the entry of a code; of one that another version made, what its name says."""
+    words = code.replace("-", " ")
+    return read_catalogue().get(code) or Entry(words, f"{{subject}}: {words}", "")
+
+
 def read_threshold(code: str, name: str) -> float:
     """Return a number that decides whether a finding is made, in the unit of its suffix."""
     return read_catalogue()[code].thresholds[name]
@@ -196,11 +202,9 @@ def make_finding(
 
 def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings without repetitions, the worst first: by severity, then by how many labels they affect."""
-    catalogue = read_catalogue()
 
     def rank(finding: Finding) -> tuple[int, int]:
-        entry = catalogue.get(finding.code)
-        return rank_severity(finding.severity), -len(entry.affects if entry else ())
+        return rank_severity(finding.severity), -len(find_entry(finding.code).affects)
 
     objects = {id(finding): finding for finding in findings}.values()  # runs share most of them, and a hash takes long
     return sorted(dict.fromkeys(objects), key=rank)
@@ -213,10 +217,7 @@ def select_findings(findings: Iterable[Finding], *codes: str) -> list[Finding]:
 
 def is_problem(finding: Finding) -> bool:
     """Return whether a finding causes exit code 3; a note never does."""
-    if finding.severity == "note":
-        return False
-    entry = read_catalogue().get(finding.code)
-    return entry is not None and entry.is_problem
+    return finding.severity != "note" and find_entry(finding.code).is_problem
 
 
 def select_problems(findings: Iterable[Finding]) -> list[Finding]:
@@ -269,12 +270,8 @@ class Verdict:
 
 def judge(findings: Iterable[Finding]) -> Verdict:
     """Return the verdict: each label has the grade of its worst finding; without a witness it is usable with care at best."""
-    catalogue, findings = read_catalogue(), tuple(findings)
-    decisive = (
-        finding
-        for finding in findings
-        if finding.severity != "note" and finding.code in catalogue and catalogue[finding.code].affects
-    )
+    findings = tuple(findings)
+    decisive = (finding for finding in findings if finding.severity != "note" and find_entry(finding.code).affects)
     reasons = tuple(sort_findings(decisive))
     witnesses = select_findings(findings, WITNESSES_OF_LABEL)
     by_label = [[finding for finding in witnesses if finding.subject.name == label] for label in AFFECTED]
@@ -287,7 +284,7 @@ def judge(findings: Iterable[Finding]) -> Verdict:
         label: "usable with care" for label, witnesses in confirmed_by.items() if witnesses == (NOTHING,)
     }
     for finding in reversed(reasons):
-        for label in catalogue[finding.code].affects:
+        for label in find_entry(finding.code).affects:
             grades[label] = max(grades.get(label, "usable"), _GRADE_OF[finding.severity], key=GRADES.index)
     return Verdict(**grades, reasons=reasons, confirmed_by=confirmed_by, labels=labels)
 

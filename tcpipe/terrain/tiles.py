@@ -13,8 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.terrain.classes import ClassTable
-from tcpipe.terrain.layers import STACKS, Layer, Stack, find_no_data_value, group_stacks
+from tcpipe.terrain.layers import STACKS, ClassTable, Layer, Stack, find_no_data_value, group_stacks
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 from tcpipe.terrain.resampling import choose_factor
 from tcpipe.terrain.sampling_kernel import Tiles, compute_morton

@@ -29,7 +29,7 @@ PRINTERS = {
     "tcpipe/pipeline/proposals.py",
     "tcpipe/pipeline/preflight.py",
     "tcpipe/pipeline/status.py",
-    "tcpipe/pipeline/store_facts.py",
+    "tcpipe/pipeline/report.py",
     "tcpipe/planning/drives.py",
     "tcpipe/planning/path_files.py",
     "tcpipe/planning/route_graph.py",

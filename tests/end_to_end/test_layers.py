@@ -26,8 +26,7 @@ from tcpipe.learning.training import _report_layers
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.verify import verify
 from tcpipe.store import open_store
-from tcpipe.terrain.classes import PAPER_CLASSES
-from tcpipe.terrain.layers import Layer
+from tcpipe.terrain.layers import PAPER_CLASSES, Layer
 
 DRAWS_DATASET_PAGES = True
 

@@ -55,7 +55,7 @@ def test_what_has_no_checksum_and_which_clock_is_simulated_is_said(tmp_path):
     found = only_run(tmp_path / "tcpipe-store").manifest
     assert found.damage == ()
     assert [of.code for of in found.notes] == ["no-checksum"]
-    assert "simulated-time" in {of.code for of in found.read_report.findings}
+    assert "simulated-time" in {of.code for of in found.findings}
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])

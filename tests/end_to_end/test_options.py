@@ -10,7 +10,7 @@ from synthetic_store import add_run, box, lanes, region_file, segments, small_st
 
 from tcpipe.formats.documents import make_key
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.store_records import Output
+from tcpipe.formats.runs import Output
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store
 

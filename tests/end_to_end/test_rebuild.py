@@ -21,8 +21,8 @@ from mcap.writer import Writer
 from stored_files import flip, read_files
 
 from tcpipe.errors import DatasetError, UsageError
+from tcpipe.formats.dataset_card import RunInputs
 from tcpipe.formats.dataset_files import read_card
-from tcpipe.formats.dataset_inputs import RunInputs
 from tcpipe.formats.integrity import compute_checksum, write_sealed
 from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.pipeline.dataset.build import build_dataset
@@ -136,7 +136,7 @@ def test_a_changed_dataset_is_named_with_its_cause(made, tmp_path, temporary):
     assert (done.returncode, found["is_identical"], found["samples"], found["differing"]) == (3, False, 18, 3)
     assert found["largest_in_std"] == pytest.approx(0.5)
     (cause,) = found["causes"]
-    assert re.fullmatch(r"results version 0 → \d+", cause)
+    assert re.fullmatch(r"version: results 0 → \d+", cause)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["old", "temporary"]
     assert list(temporary.iterdir()) == []
 

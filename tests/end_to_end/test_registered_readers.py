@@ -12,7 +12,7 @@ from package_source import PACKAGE
 
 from tcpipe import ingest, read_log
 from tcpipe.errors import LogError
-from tcpipe.formats.logs import log_names
+from tcpipe.formats.logs import table_folders
 from tcpipe.formats.logs.log_file import find_logs
 from tcpipe.pipeline.export import export
 from tcpipe.store import Store
@@ -41,9 +41,9 @@ def write_drive(path: Path) -> Path:
 def installed(monkeypatch):
     """Put the package where Python finds it, and search again."""
     monkeypatch.syspath_prepend(str(READER))
-    log_names._list_readers.cache_clear()
+    table_folders._list_readers.cache_clear()
     yield
-    log_names._list_readers.cache_clear()
+    table_folders._list_readers.cache_clear()
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def install(monkeypatch, tmp_path, installed):
         (tmp_path / package / f"{module}.py").write_text(code)
         monkeypatch.syspath_prepend(str(tmp_path / package))
         monkeypatch.delitem(sys.modules, module, raising=False)
-        log_names._list_readers.cache_clear()
+        table_folders._list_readers.cache_clear()
         (tmp_path / "a.mine").touch()
         return tmp_path / "a.mine"
 
@@ -106,7 +106,7 @@ def test_the_command_finds_the_package_by_the_path_of_python(tmp_path):
 
 
 def test_without_the_package_the_file_is_no_log(tmp_path):
-    log_names._list_readers.cache_clear()
+    table_folders._list_readers.cache_clear()
     done = tcpipe("inspect", write_drive(tmp_path / "monday.rover"), cwd=tmp_path)
     assert done.returncode != 0
     assert "monday.rover: not a log: it is" in done.stderr
@@ -158,11 +158,11 @@ def test_two_packages_for_one_suffix_are_named(install):
 
 
 def test_packages_are_searched_only_for_suffixes_that_tcpipe_does_not_read(tmp_path):
-    log_names._list_readers.cache_clear()
+    table_folders._list_readers.cache_clear()
     for name in ("a.mcap", "b.BAG", "c.db3", "d.csv", "e.ulg"):
         (tmp_path / name).touch()
     assert len(find_logs(tmp_path)) == 4
-    assert log_names._list_readers.cache_info().misses == 0
+    assert table_folders._list_readers.cache_info().misses == 0
     (tmp_path / "f.other").touch()
     assert len(find_logs(tmp_path)) == 4
-    assert log_names._list_readers.cache_info().misses == 1
+    assert table_folders._list_readers.cache_info().misses == 1

@@ -13,7 +13,7 @@ from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.route import Leg, Pause
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_small_world
 from tcpipe.tables.bits import DropReason
-from tcpipe.terrain.classes import PAPER_CLASSES
+from tcpipe.terrain.layers import PAPER_CLASSES
 
 LAP = (
     Leg(((33.0, 22.0),), command=0.5),

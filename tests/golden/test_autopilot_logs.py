@@ -19,7 +19,7 @@ from storage_server import object_store
 
 import tcpipe
 from tcpipe.errors import RoleError
-from tcpipe.formats.logs.autopilot_records import read_records
+from tcpipe.formats.logs.autopilot_log import read_records
 from tcpipe.logs.topics import split_notes
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import ReadConfig, Recipe

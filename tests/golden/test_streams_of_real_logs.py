@@ -90,7 +90,7 @@ def test_duplicates_and_backward_stamps_of_an_old_recording() -> None:
     }
     assert found.report.facts.epochs == 1
     worse = read(path, topics={"imu": ["/my_odometry2imu/imu_data"]})
-    facts = worse.report.facts.roles["imu"].topics["/my_odometry2imu/imu_data"]
+    facts = worse.report.facts.roles["imu"]["/my_odometry2imu/imu_data"]
     assert facts.messages == 13333
     assert sum(facts.dropped.values()) == 347
     assert facts.notes["sorted"] >= 31

@@ -6,11 +6,11 @@ import pytest
 from browser_page import quiet_page
 from faulty_drives import CODES, write_logs
 
-from tcpipe.formats.finding_lines import describe_finding, describe_title, list_remedies
+from tcpipe.formats.finding_lines import describe_finding, list_remedies
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.report import report
 from tcpipe.store import open_store
-from tcpipe.tables.findings import select_findings
+from tcpipe.tables.findings import find_entry, select_findings
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def test_the_first_screen_names_the_fault_and_its_remedy(chromium, runs, name):
         line = tab.locator(".verdict li", has_text=f"[{CODES[name]}]")
         box, said = line.bounding_box(), " ".join(line.inner_text().split())
         assert 0.0 < box["y"] < box["y"] + box["height"] < 900.0
-        assert describe_title(found[0]) in said
+        assert find_entry(found[0].code).title in said
         assert all(" ".join(describe_finding(finding).split()) in said for finding in found)
         assert remedies
         for purpose, changes in remedies:

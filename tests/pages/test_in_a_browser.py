@@ -262,7 +262,7 @@ def test_ids_of_a_selection_open_and_exclude_these_samples(chromium, dataset, tm
 
 def test_of_a_part_of_the_samples_the_page_says_what_a_selection_covers(chromium, dataset, tmp_path, monkeypatch):
     monkeypatch.setattr("tcpipe.report.dataset_report.MOST_SAMPLES", 30)
-    monkeypatch.setattr("tcpipe.report.dataset_patches.MOST_PATCHES", 5)
+    monkeypatch.setattr("tcpipe.report.pictures.MOST_PATCHES", 5)
     shutil.copytree(dataset, tmp_path / "dataset")
     report(tmp_path / "dataset")
     with quiet_page(chromium, tmp_path / "dataset/report.html", LOOKS[0]) as tab:
@@ -337,7 +337,7 @@ def test_the_store_s_page_fits_sorts_filters_and_leads_to_runs(store_page):
 
 
 def test_a_patch_that_is_not_inside_the_page_comes_from_the_folder_beside_it(chromium, dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr("tcpipe.report.dataset_patches.MOST_PATCHES", 5)
+    monkeypatch.setattr("tcpipe.report.pictures.MOST_PATCHES", 5)
     there = tmp_path / "dataset"
     shutil.copytree(dataset, there)
     report(there, patches=True)

@@ -9,7 +9,7 @@ from autopilot_files import Drive, write_dataflash, write_ulog
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tcpipe.formats.logs.autopilot_records import read_records
+from tcpipe.formats.logs.autopilot_log import read_records
 
 WRITERS = {"ulog": write_ulog, "dataflash": write_dataflash}
 

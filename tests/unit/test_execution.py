@@ -102,7 +102,7 @@ def test_a_script_without_a_main_guard_is_told_in_one_line(tmp_path: Path) -> No
     script, store = tmp_path / "script.py", tmp_path / "store"
     script.write_text(f"import tcpipe\ntcpipe.ingest([{str(tmp_path)!r}], store={str(store)!r}, jobs=2)\n")
     for name in "ab":
-        (tmp_path / f"{name}.mcap").write_bytes(name.encode())
+        (tmp_path / f"{name}.mcap").write_bytes(name.encode() * ord(name))
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 1
     said = done.stdout + done.stderr

@@ -1,6 +1,6 @@
 """Serialised messages of one topic to Arrow columns.
 
-`tcpipe.logs.wire_cursors` walks some thousand payloads at once. Those of equal length are gathered apart: most have one shape, and a
+`tcpipe.logs.wire_types` walks some thousand payloads at once. Those of equal length are gathered apart: most have one shape, and a
 field of all of them is a strided view. Only what a walk cannot do goes message by message.
 """
 
@@ -15,22 +15,27 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.logs.log_part import MessageBlock, gather_integers, group_by_key
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError
-from tcpipe.logs.wire_cursors import (
+from tcpipe.logs.wire_types import (
+    Array,
     Dialect,
     Fields,
     Grid,
     LayoutError,
     Lists,
     RaggedError,
+    Record,
     Runs,
+    Scalar,
     Scalars,
+    Text,
     Values,
     WalkResult,
+    WireType,
     find_dialect,
+    iterate_flat_fields,
     walk,
 )
-from tcpipe.logs.wire_types import Array, Record, Scalar, Text, WireType, iterate_flat_fields
-from tcpipe.tables.arrays import number_column
+from tcpipe.tables.columns import number_column
 
 FLUSH_BYTES = 1 << 21
 """Payloads are turned into columns when about this much has gathered: it still lies in the cache."""
@@ -322,7 +327,7 @@ def make_lists(values: pa.Array, counts: _Int64, length: int | None) -> pa.Array
 
 
 class WalkedColumns:
-    """Builds the columns of messages that `tcpipe.logs.wire_cursors` has walked; ``data`` is what it walked over."""
+    """Builds the columns of messages that `tcpipe.logs.wire_types` has walked; ``data`` is what it walked over."""
 
     def __init__(self, data: NDArray[np.uint8]) -> None:
         self.replaced_texts = 0

@@ -19,10 +19,9 @@ import pyarrow as pa
 from tcpipe.errors import LogError
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.finding_lines import describe_finding
-from tcpipe.formats.logs import bag_records, mcap_records, sqlite_file
+from tcpipe.formats.logs import bag_file, mcap_records, sqlite_file
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.bag_file import BagPart
-from tcpipe.formats.logs.log_names import find_log_suffix, is_log_file
 from tcpipe.formats.logs.log_part import FetchedFile, LogPart, MessageBlock
 from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
@@ -36,7 +35,7 @@ from tcpipe.formats.logs.rosbag2 import (
     is_one_bag,
 )
 from tcpipe.formats.logs.sqlite_file import SqlitePart
-from tcpipe.formats.logs.table_folders import is_table
+from tcpipe.formats.logs.table_folders import find_log_suffix, is_log_file, is_table
 from tcpipe.formats.object_storage import StoredObject, is_url, lay_out_objects
 from tcpipe.logs.topics import AutopilotKind, Damage, Topic, find_damage, split_notes
 from tcpipe.progress import Meter
@@ -99,7 +98,7 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
 def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | None) -> LogPart:
     """Open a file of a log until the stack ends; `LogError` where it is none, which says what it seems to be."""
     magic, given = _read_magic(path, fetched), path
-    if fetched is not None and not magic.startswith((mcap_records.MAGIC, bag_records.MAGIC)):
+    if fetched is not None and not magic.startswith((mcap_records.MAGIC, bag_file.MAGIC)):
         fetched.whole()
     if magic.startswith(ZSTD_MAGIC):
         path = decompress_file(path, stack.enter_context(make_scratch_directory()))
@@ -107,7 +106,7 @@ def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | No
     part: LogPart
     if magic.startswith(mcap_records.MAGIC) or _read_tail(path, len(mcap_records.MAGIC)) == mcap_records.MAGIC:
         part = McapPart(path, name, fetched)
-    elif magic.startswith(bag_records.MAGIC):
+    elif magic.startswith(bag_file.MAGIC):
         part = BagPart(path, name, fetched)
     elif magic.startswith(sqlite_file.MAGIC):
         part = SqlitePart(path, name)

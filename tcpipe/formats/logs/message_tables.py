@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import LogError, clean_line
 from tcpipe.formats.logs.log_file import OpenLog, hash_files
 from tcpipe.logs.topics import Damage, Topic, find_damage
-from tcpipe.tables.arrays import make_text_column, number_column
+from tcpipe.tables.columns import make_text_column, number_column
 from tcpipe.tables.findings import Finding
 
 if TYPE_CHECKING:

@@ -25,22 +25,20 @@ from tcpipe.formats.maps.raster_commands import make_table_command
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold
-from tcpipe.terrain.classes import (
+from tcpipe.terrain.layers import (
+    COLOURS,
     MAX_ID,
+    PAPER_LAYERS,
     PAPER_SCHEME,
     ClassScheme,
     ClassTable,
+    Layer,
     TerrainClass,
     find_named_scheme,
-    make_own_scheme,
-)
-from tcpipe.terrain.layers import (
-    COLOURS,
-    PAPER_LAYERS,
-    Layer,
     make_banded_layer,
     make_categorical_layer,
     make_continuous_layer,
+    make_own_scheme,
     make_paper_layers,
 )
 from tcpipe.terrain.projection import parse_crs

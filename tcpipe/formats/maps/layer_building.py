@@ -28,8 +28,7 @@ from tcpipe.formats.maps.geotiff import (
 )
 from tcpipe.formats.maps.raster_commands import make_table_command, suggest_bytes, suggest_nodata
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold
-from tcpipe.terrain.classes import ClassScheme
-from tcpipe.terrain.layers import Layer, Pixels
+from tcpipe.terrain.layers import ClassScheme, Layer, Pixels
 from tcpipe.terrain.projection import Projection, parse_crs
 from tcpipe.terrain.resampling import mean, resample_bilinear, resample_majority
 from tcpipe.terrain.target_grid import LATTICE_STEP_PX, Georeference, MapGrid, compute_source_lattice

@@ -16,11 +16,12 @@ from xml.etree.ElementTree import Element, fromstring
 from tcpipe.formats.json_files import parse_typed
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.findings import LEFT_OUT, Finding
-from tcpipe.terrain.classes import ClassTable, TerrainClass
 from tcpipe.terrain.layers import (
     PAPER_LAYERS,
+    ClassTable,
     Kind,
     Layer,
+    TerrainClass,
     make_banded_layer,
     make_categorical_layer,
     make_continuous_layer,

@@ -35,17 +35,22 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import MapError, StoreError
-from tcpipe.formats.bucket_directories import FetchedShards
-from tcpipe.formats.file_checks import prove_files
 from tcpipe.formats.integrity import read_checksums
 from tcpipe.formats.json_files import convert_record, parse_typed, read_json, to_plain
 from tcpipe.formats.maps.map_facts import Description, MapFacts, MapSummary, describe_layer, make_cf_flags, read_layers
-from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
-from tcpipe.formats.zarr_arrays import add_array, consolidate_metadata, create_group
+from tcpipe.formats.place import prove_files
+from tcpipe.formats.published_outputs import FetchedShards
+from tcpipe.formats.zarr_arrays import (
+    DESCRIPTION,
+    ShardedArray,
+    add_array,
+    consolidate_metadata,
+    create_group,
+    open_sharded,
+)
 from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.tables.levels import DATA_MODEL_VERSION
-from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
-from tcpipe.terrain.layers import PAPER_LAYERS, Layer, Pixels, find_no_data_value
+from tcpipe.terrain.layers import PAPER_LAYERS, ClassScheme, ClassTable, Layer, Pixels, TerrainClass, find_no_data_value
 from tcpipe.terrain.resampling import iterate_levels, list_factors, make_overview_grid
 from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX, MapGrid
 from tcpipe.terrain.tiles import BandReader, MapReader

@@ -23,8 +23,7 @@ from tcpipe.formats.maps.geotiff import burn_polygons
 from tcpipe.formats.maps.layer_building import Tally, label_files
 from tcpipe.splits.regions import project_near
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
-from tcpipe.terrain.classes import ClassScheme, name_key
-from tcpipe.terrain.layers import Layer, Pixels, make_paper_layers
+from tcpipe.terrain.layers import ClassScheme, Layer, Pixels, make_paper_layers, name_key
 from tcpipe.terrain.projection import Projection, compute_area
 from tcpipe.terrain.target_grid import MapGrid
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from tcpipe.errors import DatasetError, StoreError, TcpipeError, UsageError, clean_lines, list_first
 from tcpipe.execution import refuse_import_of_script
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory
-from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -23,12 +22,12 @@ from tcpipe.formats.dataset_files import (
     read_intact_card,
 )
 from tcpipe.formats.documents import State, make_key
-from tcpipe.formats.finding_lines import format_budget, format_mixed_groups, list_verdict
+from tcpipe.formats.finding_lines import format_budget, format_groups, list_verdict
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
-from tcpipe.formats.published_outputs import check_kind, find_newest, write_output
-from tcpipe.formats.store_records import Options, Output
+from tcpipe.formats.published_outputs import check_kind, fetch_directory_by_range, find_newest, write_output
+from tcpipe.formats.runs import Options, Output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, describe_error, estimate, list_ended_calls, record_call
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, plan_inputs, prove_maps
@@ -78,7 +77,7 @@ class BuildResult:
         by_run = self.card.findings_by_run if self.card else {}
         by_map = self.card.findings_by_map if self.card and not problems else {}
         groups = group_dataset_findings(own, dict.fromkeys(by_run, ()) if problems else by_run, by_map)
-        return format_mixed_groups(groups, more=f"tcpipe inspect {shlex.quote(self.path)}")
+        return format_groups(groups, more=f"tcpipe inspect {shlex.quote(self.path)}")
 
     def _facts(self) -> list[str]:
         card = self.card
@@ -290,7 +289,7 @@ def _find_left_out(
     if len(inputs.runs) < min_runs:
         count = f"{len(inputs.runs)} runs, expected {min_runs} or more (--min-runs); nothing is written"
         groups = group_dataset_findings((*chosen.damaged, *fewer), {run.run_id: () for run in inputs.runs})
-        raise DatasetError(count, *format_mixed_groups(groups))
+        raise DatasetError(count, *format_groups(groups))
     return (*chosen.damaged, *(replace(finding, severity="note") for finding in fewer))
 
 

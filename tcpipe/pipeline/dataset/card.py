@@ -40,8 +40,7 @@ from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, Verdict, make_finding, read_threshold
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LABELS
-from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import LAYERS, Layer
+from tcpipe.terrain.layers import LAYERS, PAPER_CLASSES, ClassTable, Layer
 
 VELOCITY_COLUMN = {"ground": "velocity_mps", "fused": "fused_velocity_mps"}
 """Column of samples.parquet that each choice of ``label.velocity`` trains on."""
@@ -93,6 +92,7 @@ def make_dataset_card(
     classes = content.sources[0].classes if content.sources else PAPER_CLASSES
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
     runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
+    folds = samples.column("fold").filter(pc.equal(samples.column("split"), "train"))
     card = DatasetCard(
         data_model_version=DATA_MODEL_VERSION,
         tcpipe_version=__version__,
@@ -105,7 +105,7 @@ def make_dataset_card(
         samples=samples.num_rows,
         robots=tuple(sorted(pc.unique(samples.column("robot")).to_pylist())),
         splits={name: _count(samples, "split", name) for name in SPLITS},
-        folds_of_train=_fold_counts(samples),
+        folds_of_train=tuple(np.bincount(folds.to_numpy().astype(np.int64)).tolist()),
         terrain=_count_terrain(samples) if has_terrain else {},
         label_statistics_of_train=_compute_statistics(samples),
         flagged_samples=count_flagged(samples.column("quality")),
@@ -166,12 +166,6 @@ def _describe_formula(layer: Layer) -> str:
 def _map_source(source: MapFile, sha256: str, registration: tuple[MapRegistration, ...]) -> MapSource:
     named = {"name": source.name, "layers": tuple(source.all_layers), "sha256": sha256, "registration": registration}
     return convert_record(source.facts, MapSource, **named, **asdict(source.grid))
-
-
-def _fold_counts(samples: pa.Table) -> tuple[int, ...]:
-    """Return the number of train samples of every fold."""
-    folds = samples.column("fold").filter(pc.equal(samples.column("split"), "train"))
-    return tuple(np.bincount(folds.to_numpy().astype(np.int64)).tolist())
 
 
 def _count(samples: pa.Table, column: str, value: str) -> int:

@@ -38,7 +38,7 @@ from tcpipe.formats.dataset_files import (
     make_parquet_writers,
     make_zarr_writers,
 )
-from tcpipe.formats.finding_lines import format_finding, format_mixed_groups
+from tcpipe.formats.finding_lines import format_finding, format_groups
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import (
     ROWS_PER_GROUP,
@@ -52,7 +52,7 @@ from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.map_checks import find_contradictions, find_removed_by_ground, register_runs
 from tcpipe.pipeline.dataset.options import BuildOptions
-from tcpipe.pipeline.dataset.pooling import list_needs, move_losses, pool_segments
+from tcpipe.pipeline.dataset.runs import list_needs, move_losses, pool_segments
 from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
 from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded, number_runs
 from tcpipe.recipe import CovariateConfig, Recipe, SplitConfig
@@ -60,12 +60,11 @@ from tcpipe.recipe.suggestions import format_recipe_key, suggest
 from tcpipe.robots import Robot
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, hash_ranks
 from tcpipe.stages.sample import Sampled, place_segments, sum_losses
-from tcpipe.tables.arrays import make_points
 from tcpipe.tables.bits import Loss, flag_name
-from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
+from tcpipe.tables.columns import make_points, read_lonlat_deg, to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
 from tcpipe.tables.levels import SAMPLES
-from tcpipe.terrain.classes import PAPER_CLASSES
+from tcpipe.terrain.layers import PAPER_CLASSES
 from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, parse_crs
 from tcpipe.terrain.tiles import find_map_projection
 
@@ -337,7 +336,7 @@ def _describe_uncertainty(
         f"the problems below, or accept patches with such an offset ({format_recipe_key('sample.max_position_std_m')})"
     )
     groups = group_dataset_findings((), {run.run_id: run.findings for run in inputs.sources})
-    return [line, *format_mixed_groups(groups)]
+    return [line, *format_groups(groups)]
 
 
 def _describe_coverage(source: MapFile, *, alone: bool) -> str:

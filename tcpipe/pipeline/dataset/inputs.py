@@ -22,13 +22,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, MapError, StoreError, list_first
-from tcpipe.formats.bucket_directories import FetchedShards
-from tcpipe.formats.dataset_card import DatasetCard, RunSource
-from tcpipe.formats.dataset_inputs import (
+from tcpipe.formats.dataset_card import (
     Change,
+    DatasetCard,
     DatasetInputs,
     ExclusionInputs,
     RunInputs,
+    RunSource,
     compare_records,
     format_value,
 )
@@ -37,14 +37,13 @@ from tcpipe.formats.geojson import regions_to_json
 from tcpipe.formats.integrity import compute_checksums
 from tcpipe.formats.json_files import convert_record, digest
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.runs import RunFacts
-from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.published_outputs import FetchedShards
+from tcpipe.formats.runs import RunFacts, StoredMap
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
 from tcpipe.store import Store
-from tcpipe.tables.arrays import encode_rows, number_column
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import encode_rows, number_column, to_floats, to_integers
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import RESULTS_VERSION, TABLES_VERSION
 
@@ -311,7 +310,13 @@ def remove_duplicates(runs: Sequence[StoredRun]) -> UniqueRuns:
 
     @lru_cache(maxsize=_WAYS)
     def way(index: int) -> _SegmentPositions:
-        return _read_positions(runs[index])
+        run = runs[index]
+        names = [f"{end}_{what}" for end in ("start", "end") for what in ("ns", "lon_deg", "lat_deg")]
+        table = run.table("segments", names)
+        middle = [
+            (to_floats(table, f"start_{axis}_deg") + to_floats(table, f"end_{axis}_deg")) / 2 for axis in ("lon", "lat")
+        ]
+        return _SegmentPositions(to_integers(table, "start_ns"), to_integers(table, "end_ns"), np.column_stack(middle))
 
     again: dict[str, Mask] = {}
     findings: list[Finding] = []
@@ -414,15 +419,6 @@ def _find_span_ns(facts: RunFacts) -> tuple[int, int]:
     if facts.start_ns is None or facts.end_ns is None:
         return -_NEVER_NS, _NEVER_NS
     return facts.start_ns, facts.end_ns
-
-
-def _read_positions(run: StoredRun) -> _SegmentPositions:
-    names = [f"{end}_{what}" for end in ("start", "end") for what in ("ns", "lon_deg", "lat_deg")]
-    table = run.table("segments", names)
-    middle = [
-        (to_floats(table, f"start_{axis}_deg") + to_floats(table, f"end_{axis}_deg")) / 2 for axis in ("lon", "lat")
-    ]
-    return _SegmentPositions(to_integers(table, "start_ns"), to_integers(table, "end_ns"), np.column_stack(middle))
 
 
 def _find_shared(mine: _SegmentPositions, other: _SegmentPositions) -> Mask:

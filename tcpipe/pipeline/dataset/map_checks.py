@@ -33,7 +33,7 @@ from tcpipe.stages.sample import Sampled, Shifts
 from tcpipe.tables.bits import DropReason, Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, read_threshold
-from tcpipe.terrain.classes import PAPER_CLASSES
+from tcpipe.terrain.layers import PAPER_CLASSES
 from tcpipe.terrain.projection import Projection, compute_geoid_height
 from tcpipe.terrain.registration import (
     REACH_M,
@@ -415,18 +415,14 @@ def _read_intervals(
     uphill = -np.degrees(to_floats(track, "pitch_rad")) * np.sign(to_floats(track, "forward_velocity_mps"))
     slope = np.searchsorted(_SLOPES_DEG, 0.5 * (uphill[1:] + uphill[:-1]))
     lonlat = np.stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")], axis=1)
-    return length_m, reason, slope, _find_classes(grounds, 0.5 * (lonlat[1:] + lonlat[:-1]), run.run_id)
-
-
-def _find_classes(grounds: Sequence[_Ground], lonlat_deg: NDArray[np.float64], run_id: str) -> NDArray[np.int64]:
-    """Return the class id under each point of a run on the first map with one there, else as `find_classes_at`; 0 without maps."""
+    lonlat_deg = 0.5 * (lonlat[1:] + lonlat[:-1])
     class_id = np.full(len(lonlat_deg), OFF_THE_MAP if grounds else 0, np.int64)
     for source, projection, shifts in grounds:
         unknown = class_id <= 0
-        moved_m = shifts.get(run_id, (0.0, 0.0, 0.0))[:2]
+        moved_m = shifts.get(run.run_id, (0.0, 0.0, 0.0))[:2]
         on_map = find_classes_at(source, projection.forward(lonlat_deg[unknown]) + moved_m)
         class_id[unknown] = np.maximum(on_map, class_id[unknown])
-    return class_id
+    return length_m, reason, slope, class_id
 
 
 def _find_bias(groups: Sequence[Group], kind: SubjectKind) -> list[Finding]:

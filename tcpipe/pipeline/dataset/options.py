@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import pyarrow as pa
 
 from tcpipe.errors import DatasetError, RecipeError, UsageError
-from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_sample_ids, read_samples
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.integrity import Checksum, compute_checksum
 from tcpipe.formats.object_storage import make_absolute
+from tcpipe.formats.published_outputs import fetch_directory_by_range
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.recipe import CovariateConfig, Recipe, TrainConfig

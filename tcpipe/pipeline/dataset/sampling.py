@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import TcpipeError
 from tcpipe.execution import run_all, unwrap_result
-from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import make_mapped_array, move_rows_to_file, move_to_file, take_rows
+from tcpipe.formats.published_outputs import FetchedShards
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled, Shifts, check_same_layers, sample_on_maps
@@ -44,9 +44,6 @@ _CELL_DEG = 1e-4
 """Batches follow a space-filling curve over cells of this size, so that few batches decode a map tile."""
 
 _PLACING = ("map_index", "position_std_m", "footprint_xy_m", "footprint_lonlat_deg")
-_SAMPLED = ("kept", "lost_by", *_PLACING)
-
-_SIZE_BYTES = 8
 
 _HELD_MAPS = 2
 """Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""

@@ -13,8 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import LOCAL, DatasetCard, RunSource, SplitResult, judge_dataset
-from tcpipe.formats.dataset_inputs import DatasetInputs
+from tcpipe.formats.dataset_card import LOCAL, DatasetCard, DatasetInputs, RunSource, SplitResult, judge_dataset
 from tcpipe.formats.parquet import ROWS_PER_GROUP
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.geometry.datum import enu_from_geodetic

@@ -21,13 +21,13 @@ from tcpipe.formats.dataset_files import (
     HUB_CARD,
     OVERVIEW,
     RELIEF,
-    REPORT,
     SAMPLES,
 )
 from tcpipe.formats.hub_card import format_croissant, format_hub_card
 from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.parquet import map_table, write_parquet_rows, write_pieces
+from tcpipe.formats.place import REPORT
 from tcpipe.pipeline.dataset.card import (
     CARD_COLUMNS,
     PHYSICS_COLUMNS,

@@ -5,7 +5,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tcpipe.pipeline.log_sources import LogSource, group_possible_duplicates, select_shard
+from tcpipe.pipeline.log_sources import LogSource, select_shard
 
 PLACES = st.lists(st.text("ab/0_", min_size=1, max_size=12), unique=True, max_size=30)
 
@@ -22,17 +22,3 @@ def test_shares_are_disjoint_and_together_whole_and_no_other_log_moves_one(place
         assert select_shard(sources(places, folder="/mnt/elsewhere"), (index, count)) == share
         more = select_shard(sources(["A", *places]), (index, count))
         assert [at - 1 for at in more if at] == share
-
-
-@given(st.lists(st.sampled_from([b"", b"x", b"y", b"x" * 5000, b"y" + b"x" * 4999]), max_size=8))
-def test_what_is_the_same_is_always_alike(tmp_path_factory, contents):
-    folder, found = tmp_path_factory.mktemp("alike"), list[LogSource]()
-    for number, data in enumerate(contents):
-        (path := folder / f"{number}.mcap").write_bytes(data)
-        found.append(LogSource((path,), ((len(data), 0),)))
-    groups = group_possible_duplicates(found)
-    assert sorted(at for group in groups for at in group) == list(range(len(contents)))
-    for at, data in enumerate(contents):
-        (group,) = (group for group in groups if at in group)
-        assert {other for other, same in enumerate(contents) if same == data} <= set(group)
-        assert {len(contents[other]) for other in group} == {len(data)}

@@ -6,7 +6,7 @@ from synthetic_store import add_run, lanes, segments
 
 from tcpipe.cli import cli
 from tcpipe.formats.documents import make_key
-from tcpipe.formats.store_records import StoredMap
+from tcpipe.formats.runs import StoredMap
 from tcpipe.simulation.scenarios import SCENARIOS
 from tcpipe.store import open_store
 from tcpipe.tables.levels import DATA_MODEL_VERSION

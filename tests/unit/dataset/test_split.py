@@ -13,8 +13,7 @@ from tcpipe.dataset.tensor import make_tensor_layout
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.terrain.classes import ClassTable, TerrainClass
-from tcpipe.terrain.layers import LAYERS, make_paper_layers
+from tcpipe.terrain.layers import LAYERS, ClassTable, TerrainClass, make_paper_layers
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from tcpipe.formats.documents import (
     scan,
 )
 from tcpipe.formats.place import Place
-from tcpipe.formats.store_records import Call, Failure, Output, Tags
+from tcpipe.formats.runs import Call, Failure, Output, Tags
 
 
 @pytest.fixture(params=["directory", "bucket"])
@@ -228,7 +228,7 @@ def test_a_process_that_scans_again_reads_what_others_have_written_meanwhile_and
     assert read == []
     program = (
         "import sys; from pathlib import Path; from tcpipe.formats.documents import *\n"
-        "from tcpipe.formats.place import Place; from tcpipe.formats.store_records import Tags\n"
+        "from tcpipe.formats.place import Place; from tcpipe.formats.runs import Tags\n"
         "place = Place(Path(sys.argv[1])); state = scan(place)\n"
         "put_document(place, state, 'tags', make_key('log 1'), Tags('log 1', {'by': 'another'}))\n"
         "put_document(place, state, 'tags', make_key('log 9'), Tags('log 9', {'by': 'another'}))\n"
@@ -343,28 +343,6 @@ def test_an_index_that_names_documents_which_are_gone_gives_none_of_them(here):
 
 def refuse(*_, **__):
     raise StoreError("read-only")
-
-
-def test_a_reader_that_may_not_write_into_a_store_keeps_the_index_in_its_cache(here, tmp_path, monkeypatch):
-    put_many(here, 20)
-    monkeypatch.setattr(Place, "put", refuse)
-    first = scan_anew(here)
-    assert (first.read, index(here)) == (20, None)
-    assert [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
-    second = scan_anew(here)
-    assert (second.read, describe(second)) == (0, describe(first))
-    shutil.rmtree(tmp_path / "cache")
-    assert scan_anew(here).read == 20
-
-
-def test_a_reader_that_may_not_write_into_a_store_adds_to_its_index_in_its_cache(here, monkeypatch):
-    scan_anew(here)
-    state = put_many(here, 20)
-    scan_anew(here)
-    put_many(here, 40, state)
-    monkeypatch.setattr(Place, "put", refuse)
-    assert scan_anew(here).read == 40
-    assert scan_anew(here).read == 0
 
 
 @settings(max_examples=30)

@@ -78,7 +78,10 @@ def test_findings_of_several_runs_are_one_line_a_code():
         format_group(groups[1], 3)
         == f"2 of 3 runs: {title} (command; 60 % to 70 %). To accept any speed: [mask] require_full_speed = false [driven-below-limit]"
     )
-    assert format_groups(groups, 3, more="tcpipe report STORE")[-1] == "and 1 note: tcpipe report STORE"
+    assert (
+        format_groups([(group, 3, "runs") for group in groups], more="tcpipe report STORE")[-1]
+        == "and 1 note: tcpipe report STORE"
+    )
 
 
 def test_a_finding_of_another_version_or_without_its_fields_is_a_line_all_the_same():

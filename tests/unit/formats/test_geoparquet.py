@@ -7,7 +7,7 @@ import pyarrow as pa
 from pyproj import CRS
 
 from tcpipe.formats.parquet import add_geo_metadata
-from tcpipe.tables.arrays import make_points
+from tcpipe.tables.columns import make_points
 
 POINTS = np.array([[15.5, 47.0], [np.nan, np.nan], [15.25, 47.5]])
 

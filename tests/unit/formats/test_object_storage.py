@@ -9,7 +9,7 @@ from storage_server import FORBIDDEN
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.logs.log_names import is_log_file
+from tcpipe.formats.logs.table_folders import is_log_file
 from tcpipe.formats.object_storage import lay_out_objects, make_stand_ins
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe

@@ -33,7 +33,7 @@ from tcpipe.learning.predictions import predict_costs
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import select_findings
-from tcpipe.terrain.classes import PAPER_CLASSES
+from tcpipe.terrain.layers import PAPER_CLASSES
 
 pytest.importorskip("torch")
 

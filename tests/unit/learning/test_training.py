@@ -16,8 +16,7 @@ from tcpipe.learning import network_model
 from tcpipe.learning.fitting import FitConfig, compute_loss_factors
 from tcpipe.learning.models import HISTORY, WEIGHTS, load_model
 from tcpipe.learning.training import Variant, find_training_range, select_train, train
-from tcpipe.terrain.classes import NODATA_ID
-from tcpipe.terrain.layers import HEIGHT_NODATA
+from tcpipe.terrain.layers import HEIGHT_NODATA, NODATA_ID
 
 torch = pytest.importorskip("torch")
 

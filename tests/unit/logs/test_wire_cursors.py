@@ -5,8 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from tcpipe.logs.wire_cursors import Grid, LayoutError, find_dialect, walk
-from tcpipe.logs.wire_types import Array, Scalar, make_record
+from tcpipe.logs.wire_types import Array, Grid, LayoutError, Scalar, find_dialect, make_record, walk
 
 U8, U32, F32, F64 = Scalar("u1"), Scalar("u4"), Scalar("f4"), Scalar("f8")
 LITTLE = b"\x00\x01\x00\x00"

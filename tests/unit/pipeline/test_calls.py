@@ -19,7 +19,7 @@ from wheel_drives import START_NS, ask_status, drive_at
 from tcpipe.cli import cli
 from tcpipe.errors import StoreError, TcpipeError, UsageError
 from tcpipe.formats import documents
-from tcpipe.formats.store_records import Call
+from tcpipe.formats.runs import Call
 from tcpipe.pipeline import calls
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import status as status_module

@@ -108,8 +108,7 @@ def test_a_log_that_has_changed_is_exported_again(tmp_path, log):
 def test_files_of_another_log_are_not_overwritten(tmp_path, log):
     export(log, tmp_path / "out", topics=["/Imu"])
     other = write_mcap(tmp_path / "b.mcap", random_messages(2, count=30, types=TYPES))
-    export(other, tmp_path / "out", topics=["/Path"])
-    with pytest.raises(UsageError, match=r"contains the same topics of .*a\.mcap; give another directory"):
+    with pytest.raises(UsageError, match=r"contains topics of .*a\.mcap; give another directory"):
         export(other, tmp_path / "out")
 
 

@@ -49,14 +49,11 @@ def test_faults_that_were_put_in_are_found(tmp_path):
     assert stamps.messages_read == one.messages == 3000
     assert stamps.gaps == 1
     assert stamps.longest_gap_s == pytest.approx(4.02)
-    assert stamps.median_period_s == pytest.approx(0.02)
     kinds = ("zero_stamps", "backward_stamps", "repeated_stamps", "duplicates")
     assert [getattr(stamps, kind) for kind in kinds] == [1, 1, 0, 1]
-    assert stamps.longest_gap_at_ns == log_ns[1999]
     assert topics["/stepped"].stamps.longest_gap_s == pytest.approx(4.02)  # the step of its header is none
     assert one.time == "header"
     assert one.header_minus_log_s == pytest.approx(-0.003)
-    assert found.clock_epochs == 2
     (step,) = found.clock_steps
     assert step.step_s == pytest.approx(7.0)
     assert step.topics == ("/stepped",)

@@ -10,11 +10,10 @@ from tcpipe.cli import cli
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.pipeline.audit import audit
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.named_runs import find_named_run, find_named_runs, is_path
 from tcpipe.pipeline.overlay import write_overlay
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import ReadConfig, Recipe
-from tcpipe.store import open_store
+from tcpipe.store import find_named_run, find_named_runs, is_path, open_store
 
 OTHER = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
 

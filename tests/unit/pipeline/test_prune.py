@@ -9,7 +9,7 @@ from synthetic_store import add_run, add_world, lanes, make_fixes, segments, sup
 from tcpipe.errors import UsageError
 from tcpipe.formats import documents
 from tcpipe.formats.documents import BLOBS, make_key
-from tcpipe.formats.store_records import Output
+from tcpipe.formats.runs import Output
 from tcpipe.pipeline import calls
 from tcpipe.pipeline.calls import INGEST, identify_process, list_open_calls, record_call
 from tcpipe.pipeline.prune import prune

@@ -12,7 +12,7 @@ from wheel_drives import START_NS, ask_status, drive_at
 from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.errors import UsageError
-from tcpipe.formats.store_records import Call, Output
+from tcpipe.formats.runs import Call, Output
 from tcpipe.pipeline import calls
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import ingest_run as ingest_run_module

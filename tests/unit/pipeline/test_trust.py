@@ -15,10 +15,11 @@ from synthetic_store import add_run, box, lanes, make_fixes, region_file, segmen
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
-from tcpipe.formats import documents, file_checks
+from tcpipe.formats import documents
+from tcpipe.formats import place as places
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, seal_page, write_sealed
 from tcpipe.formats.json_files import to_plain
-from tcpipe.formats.store_records import Output
+from tcpipe.formats.runs import Output
 from tcpipe.pipeline.calls import record_call
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import _match_by_time, diff
@@ -278,7 +279,7 @@ def test_causes_and_effects_are_named(made, copy, tmp_path):
     assert found.causes == (
         "recipe: sample.patch_m 1.0 → 0.8",
         "recipe: split.holdout block → sample",
-        "log: added later.mcap (run later, 28 samples)",
+        "run: added later",
         "region: removed",
     )
     assert found.samples == {
@@ -368,8 +369,8 @@ def test_a_shard_of_another_build_is_refused_though_its_own_checksums_agree(copy
 def test_a_digest_is_found_once_until_the_file_changes(copy, monkeypatch, tmp_path):
     monkeypatch.setenv("TCPIPE_CACHE", str(tmp_path / "cache"))
     dataset, hashed = copy("zarr"), []
-    whole = file_checks._compute_digest
-    monkeypatch.setattr(file_checks, "_compute_digest", lambda place, name: hashed.append(name) or whole(place, name))
+    whole = places._compute_digest
+    monkeypatch.setattr(places, "_compute_digest", lambda place, name: hashed.append(name) or whole(place, name))
 
     def hashed_shards():
         return sorted(name for name in hashed if "/c/" in name)

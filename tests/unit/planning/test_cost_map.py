@@ -18,7 +18,7 @@ from ruamel.yaml import YAML
 from stored_files import flip
 
 from tcpipe.errors import MapError, ModelError, UsageError
-from tcpipe.formats.bucket_directories import fetch_directory
+from tcpipe.formats.published_outputs import fetch_directory
 from tcpipe.pipeline.verify import verify
 from tcpipe.planning.cost_grid import ANGLES_DEG, iterate_blocks, make_grid
 from tcpipe.planning.cost_map import make_cost_map, make_cost_map_key, open_cost_map, read_cost_map_card

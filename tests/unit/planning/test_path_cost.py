@@ -13,7 +13,7 @@ from tcpipe.errors import ModelError, PathError
 from tcpipe.planning.cost_model import Reason
 from tcpipe.planning.path_cost import compute_path_cost, cut_path
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
-from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
+from tcpipe.terrain.layers import PAPER_CLASSES, ClassTable
 
 MODEL = PhysicsModel()
 TURNS = PhysicsFit(500, (PhysicsTerm("turning", "all", 80.0, 2.0, "J/rad"),), {}, 0.4, 8.0, {}, None, 0.05)

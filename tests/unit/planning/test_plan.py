@@ -13,7 +13,7 @@ from tcpipe.planning.cost_grid import make_survey
 from tcpipe.planning.picture import draw_plans
 from tcpipe.planning.plan import OBJECTIVES, plan_paths
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
-from tcpipe.terrain.classes import ClassTable, TerrainClass
+from tcpipe.terrain.layers import ClassTable, TerrainClass
 
 MODEL = PhysicsModel(patch_px=8)
 

@@ -13,7 +13,7 @@ from planning_worlds import NORTH_M, WEST_M, lonlat, plane
 from shared_data import shared_data
 
 from tcpipe.errors import PathError, UsageError
-from tcpipe.formats.route_graph import make_route_graph, read_route_graph
+from tcpipe.formats.maps.nav2 import make_route_graph, read_route_graph
 from tcpipe.planning.path_cost import compute_path_cost
 from tcpipe.planning.route_graph import connect_lines, write_route_graph
 

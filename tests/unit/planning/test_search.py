@@ -31,7 +31,7 @@ from tcpipe.planning.search import (
     make_steps,
 )
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
-from tcpipe.terrain.classes import PAPER_CLASSES
+from tcpipe.terrain.layers import PAPER_CLASSES
 from tcpipe.terrain.target_grid import MapGrid
 
 MAX_DETOUR = 1.0 / math.cos(math.atan2(1.0, 2.0) / 2.0)

@@ -15,12 +15,11 @@ from tcpipe.formats import documents
 from tcpipe.formats.documents import make_key
 from tcpipe.formats.place import open_place
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.store_records import Call, Failure, StoredMap
+from tcpipe.formats.runs import Call, Failure, StoredMap
 from tcpipe.pipeline import report as report_module
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.report import report
-from tcpipe.pipeline.store_facts import find_changes, find_shift
+from tcpipe.pipeline.report import find_changes, find_shift, report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store

@@ -203,9 +203,9 @@ def test_a_whole_husky() -> None:
     assert codes(found) == {"current-sign-assumed"}
     facts = found.report.facts
     assert facts.epochs == 1
-    assert facts.roles["imu"].topics["/imu/data"].rows == 500
-    assert abs(facts.roles["imu"].topics["/imu/data"].rate_hz - 50.0) < 1e-6
-    assert facts.roles["gnss"].topics["/fix"].time.offset_s == -0.002
+    assert facts.roles["imu"]["/imu/data"].rows == 500
+    assert abs(facts.roles["imu"]["/imu/data"].rate_hz - 50.0) < 1e-6
+    assert facts.roles["gnss"]["/fix"].time.offset_s == -0.002
 
 
 def test_the_rails_keep_their_names_and_their_sum_is_the_robots_current() -> None:
@@ -344,7 +344,7 @@ def test_nmea_sentences_play_gnss_on_their_own_time() -> None:
     gnss = found.tables["gnss"]
     assert gnss["stamp_ns"].to_pylist() == FIXED_NS.tolist()
     assert set(gnss["alt_m"].to_pylist()) == {400.0}
-    assert found.report.facts.roles["gnss"].topics["/nmea_sentence"].dropped == {"not_gga": 20}
+    assert found.report.facts.roles["gnss"]["/nmea_sentence"].dropped == {"not_gga": 20}
     assert "messages-unused" not in codes(found)
 
 

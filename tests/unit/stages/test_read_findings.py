@@ -51,11 +51,9 @@ def test_facts_of_a_plain_topic():
     found = read()
     assert found.findings == ()
     facts = found.facts
-    assert (facts.robot.name, facts.left_out, facts.epochs) == ("husky", {"/other": "it is slower"}, 1)
+    assert (facts.left_out, facts.epochs) == ({"/other": "it is slower"}, 1)
     assert (facts.time_offset_s, facts.power) == ({"gnss": 0.25}, None)
-    role = facts.roles["gnss"]
-    assert (role.why, role.frame, role.placed_by) == ("the only one", "gps", "tf_static")
-    topic = role.topics["/fix"]
+    topic = facts.roles["gnss"]["/fix"]
     assert (topic.type, topic.messages, topic.rows) == (SENSOR.type_name, COUNT, COUNT)
     assert topic.rate_hz == pytest.approx(10.0)
     assert (topic.time.source, topic.time.offset_s) == ("header", 0.5)
@@ -100,7 +98,7 @@ def test_a_topic_without_a_timeline_plays_no_part_but_says_what_it_lacks():
     odd = make_finding("geoid-separation-missing", Subject("role", "gnss"))
     found = read(source(findings=(odd,), dropped={"no_fix": COUNT}), timelines={})
     assert codes(found) == ["geoid-separation-missing", "messages-unused"]
-    assert found.facts.roles["gnss"].topics == {}
+    assert found.facts.roles["gnss"] == {}
 
 
 def test_steps_of_the_clock_divide_epochs_and_each_warning_comes_once():
@@ -118,9 +116,9 @@ def test_steps_of_the_clock_divide_epochs_and_each_warning_comes_once():
 def test_a_rate_is_that_inside_epochs_and_unknown_of_one_row():
     stamp_ns = np.array([0, 100, 200, 5200, 5300]) * 1_000_000
     two = timeline(stamp_ns=stamp_ns, clock_epoch=np.array([0, 0, 0, 1, 1], np.int16))
-    assert read(clock=two).facts.roles["gnss"].topics["/fix"].rate_hz == pytest.approx(10.0)
+    assert read(clock=two).facts.roles["gnss"]["/fix"].rate_hz == pytest.approx(10.0)
     single = timeline(stamp_ns=stamp_ns[:1], clock_epoch=np.zeros(1, np.int16), row=np.arange(1))
-    assert read(clock=single).facts.roles["gnss"].topics["/fix"].rate_hz is None
+    assert read(clock=single).facts.roles["gnss"]["/fix"].rate_hz is None
 
 
 ODD = make_finding("power-includes-loads", Subject("role", "power"), names={"loads": "computers"})
@@ -129,6 +127,6 @@ POWER = PowerReadings(findings=(ODD,), facts=PowerSign("drawn", averaged=True, i
 
 def test_notes_that_count_nothing_are_left_out_and_powers_are_told():
     found = read(source(notes={"zero": 0, "set_aside": 3}), power=POWER)
-    assert found.facts.roles["gnss"].topics["/fix"].notes == {"set_aside": 3}
+    assert found.facts.roles["gnss"]["/fix"].notes == {"set_aside": 3}
     assert found.facts.power == PowerSign("drawn", averaged=True, includes=("computers",))
     assert found.findings == (ODD,)

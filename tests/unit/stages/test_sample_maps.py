@@ -8,7 +8,7 @@ from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import sample_on_maps, sample_segments, sum_losses
 from tcpipe.tables.bits import Loss
-from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
+from tcpipe.terrain.layers import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.target_grid import MapGrid
 
 CRS = "EPSG:32633"

@@ -10,7 +10,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tcpipe.tables.arrays import (
+from tcpipe.tables.columns import (
     make_lines,
     make_points,
     make_text_column,
@@ -70,7 +70,7 @@ def test_pandas_stays_where_it_is():
     program = """
 import sys
 import numpy as np, pyarrow as pa
-from tcpipe.tables.arrays import *
+from tcpipe.tables.columns import *
 column = number_column(np.array([1.0, np.nan]), nan_is_null=True)
 table = pa.Table.from_arrays([column, make_text_column(["a", "b"])], names=["x", "y"])
 to_numbers(table["x"]), to_texts(table["y"]), select_rows(table, "y", "b")

@@ -20,8 +20,7 @@ from random_messages import (
 )
 from rosbags.rosbag1 import Writer as BagWriter
 
-from tcpipe.formats.logs.bag_file import BagPart
-from tcpipe.formats.logs.bag_records import read_indexed_messages
+from tcpipe.formats.logs.bag_file import BagPart, read_indexed_messages
 from tcpipe.formats.logs.chunk_reading import Excerpt
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets

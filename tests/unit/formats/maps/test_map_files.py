@@ -12,14 +12,13 @@ from map_worlds import World
 from stored_files import flip
 
 from tcpipe.errors import MapError
-from tcpipe.formats.bucket_directories import fetch_files
 from tcpipe.formats.integrity import compute_checksums, write_checksums
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter, open_map
 from tcpipe.formats.place import open_place
-from tcpipe.terrain.classes import PAPER_SCHEME
-from tcpipe.terrain.layers import make_paper_layers
+from tcpipe.formats.published_outputs import fetch_files
+from tcpipe.terrain.layers import PAPER_SCHEME, make_paper_layers
 from tcpipe.terrain.target_grid import MapGrid
 
 FACTS = MapFacts(

@@ -21,7 +21,7 @@ from tcpipe.errors import MapError, RegionError
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.terrain.classes import PAPER_SCHEME
+from tcpipe.terrain.layers import PAPER_SCHEME
 
 WORLD = World("EPSG:32633", 560_000.0, 5_215_000.0, side_m=20.0)
 TOP_LEFT = Affine(0.2, 0.0, WORLD.x_m - 10.0, 0.0, -0.2, WORLD.y_m + 10.0)

@@ -25,7 +25,7 @@ from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, Stor
 from tcpipe.formats.dataset_card import KeptSplit
 from tcpipe.formats.documents import State
 from tcpipe.formats.recipe_toml import make_recipe_id, parse_recipe
-from tcpipe.formats.store_records import Call
+from tcpipe.formats.runs import Call
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig

@@ -145,15 +145,12 @@ def test_explain_and_diff_tell_it(store, plain, tmp_path):
     with pytest.raises(DatasetError, match=f"{ids[1]} was excluded when the dataset was built, by ids.csv: {WHY}"):
         explain(ids[1], dataset=tmp_path / "out", store=store.root)
     found = diff(tmp_path / "plain", tmp_path / "out")
-    assert f"exclusion: added ids.csv (3 samples): {WHY}" in found.causes
+    assert "exclusion: added ids.csv" in found.causes
     assert found.samples["only in a"] == 3
     assert (found.moved, found.samples["other fold"]) == ({}, 0)
     (tmp_path / "out").rename(tmp_path / "earlier")
     build(store, tmp_path, ids=ids[:1])
-    assert (
-        f"exclusion: ids.csv is another list: 3 → 1 samples, {WHY} → {WHY}"
-        in diff(tmp_path / "earlier", tmp_path / "out").causes
-    )
+    assert "exclusion: ids.csv.sha256 is another one" in diff(tmp_path / "earlier", tmp_path / "out").causes
 
 
 def test_its_own_list_makes_the_same_dataset_without_the_first(store, plain, tmp_path):

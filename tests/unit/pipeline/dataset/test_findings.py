@@ -11,7 +11,7 @@ from synthetic_store import add_run, lanes, open_world, segments
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import RunSource, group_dataset_findings, judge_dataset
-from tcpipe.formats.finding_lines import format_mixed_groups
+from tcpipe.formats.finding_lines import format_groups
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.card import count_flagged
 from tcpipe.pipeline.diff import diff
@@ -33,7 +33,7 @@ def run(run_id, samples, *findings):
 
 
 def lines(*runs, own=()):
-    return format_mixed_groups(group_dataset_findings(own, {of.run_id: of.findings for of in runs}), more="inspect")
+    return format_groups(group_dataset_findings(own, {of.run_id: of.findings for of in runs}), more="inspect")
 
 
 def test_findings_of_one_code_are_one_line_with_how_many_runs_and_the_range():

@@ -142,12 +142,12 @@ def test_a_file_of_others_that_the_new_dataset_would_replace_is_kept(here):
 
 CAUSES = {
     "covariates": ({"covariates": "soil.csv"}, {}, ("covariates: removed soil.csv",)),
-    "content of covariates": ({"covariates": "soil.csv"}, {"covariates": "wet/soil.csv"}, ("covariates: soil.csv is another table",)),
+    "content of covariates": ({"covariates": "soil.csv"}, {"covariates": "wet/soil.csv"}, ("covariates: soil.csv is another one",)),
     "chosen tags": ({"tags": {"weather": "dry"}}, {"tags": {}},
-    ("log: added wet.mcap (run wet, 20 samples)", "chosen tags: weather dry → none")),
-    "order of maps": ({"map_name": ["site", "yard"]}, {"map_name": ["yard", "site"]}, ("map: order site, yard → yard, site",)),
-    "map": ({"map_name": "site"}, {"map_name": "yard"}, ("map: added yard", "map: removed site")),
-    "region": ({"split": "region.geojson"}, {"split": "other.geojson"}, ("region: another one",)),
+    ("run: added wet", "chosen tags: weather dry → none")),
+    "order of maps": ({"map_name": ["site", "yard"]}, {"map_name": ["yard", "site"]}, ("order of maps: site, yard → yard, site",)),
+    "map": ({"map_name": "site"}, {"map_name": "yard"}, ("map: added yard", "map: removed site", "order of maps: site → yard")),
+    "region": ({"split": "region.geojson"}, {"split": "other.geojson"}, ("region: train_test is another one",)),
     "kept split": ({}, {"keep_split": "dataset"}, ("kept split: added",)),
 }  # fmt: skip
 
@@ -182,7 +182,7 @@ def test_diff_names_other_tags_of_a_run(here):
     store = open_store(here / "store")
     tag_run(store, "dry", {"soil": "clay"})
     build_dataset(here / "b", **usual(here))
-    assert diff(here / "dataset", here / "b").causes == ("tags: run dry soil none → clay",)
+    assert diff(here / "dataset", here / "b").causes == ("run: dry.tags.soil none → clay",)
 
 
 def test_other_runs_and_another_map_of_the_name_are_built_in_unasked(here):

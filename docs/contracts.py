@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from importlib import import_module
 from typing import Any
 
 import pyarrow as pa
@@ -24,11 +24,11 @@ DOCUMENTS = {"run": Run, "dataset": DatasetCard}
 """The JSON documents that others read, by the name of their schema."""
 
 
-def make_contracts(answers: Mapping[str, type]) -> dict[str, str]:
+def make_contracts() -> dict[str, str]:
     """Return file name → JSON Schema text, for every table (one row as an object), the recipe, and every document and answer."""
     tables = (*STREAMS.values(), MASKED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
     schemas = {table.name: _make_table_schema(table) for table in tables} | {"recipe": _make_recipe_schema()}
-    documents = {**DOCUMENTS, **answers}
+    documents = {**DOCUMENTS, **json_output_types()}
     pointers, definitions = describe(*documents.values(), file=f"{DEFINITIONS}.schema.json")
     inner = to_json(definitions)
     for name, pointer in zip(documents, pointers, strict=True):
@@ -72,3 +72,53 @@ def _make_column_schema(column: Column) -> dict[str, Any]:
     if column.flags is not None:
         schema["x-flags"] = {str(int(bit)): flag_name(bit) for bit in column.flags}
     return schema
+
+
+_ANSWERS = {
+    "model": "learning.model_card.ModelCard",
+    "cost-map": "planning.cost_map.CostMapCard",
+    "evaluation": "learning.evaluation_facts.Evaluation",
+    "path-totals": "planning.path_files.TableTotals",
+    "plan": "planning.path_files.PlanFile",
+    "reproduction": "experiment.reproduction.ReproductionSummary",
+    "acknowledge.answer": "pipeline.problems.Acknowledged",
+    "add-map.answer": "pipeline.maps.AddedMap",
+    "audit.answer": "pipeline.audit.Audit",
+    "build-dataset.answer": "pipeline.dataset.build.BuildResult",
+    "check-split.answer": "pipeline.split_check.SplitCheck",
+    "cost-map.answer": "planning.cost_map.CostMapResult",
+    "diff.answer": "pipeline.diff.Difference",
+    "rebuild.answer": "pipeline.rebuild.Rebuilt",
+    "evaluate-adaptation.answer": "learning.evaluation_files.AdaptationFacts",
+    "evaluate-drives.answer": "planning.drives.Drives",
+    "explain.answer": "pipeline.explain.Explained",
+    "export.answer": "pipeline.export.Exported",
+    "failure.answer": "cli.output.Failure",
+    "ingest-log.answer": "pipeline.plan.LogLine",
+    "ingest-summary.answer": "pipeline.ingest.SummaryLine",
+    "inspect-dataset.answer": "pipeline.inspected.InspectedDataset",
+    "inspect-log.answer": "pipeline.log_inspection.InspectedLog",
+    "inspect-logs.answer": "pipeline.inspect.InspectedLogs",
+    "inspect-map.answer": "pipeline.inspected.InspectedMap",
+    "inspect-run.answer": "pipeline.inspect.InspectedRun",
+    "inspect-store.answer": "pipeline.inspect.InspectedStore",
+    "inspect-tables.answer": "pipeline.inspect.InspectedTables",
+    "overlay.answer": "pipeline.overlay.Overlay",
+    "plan-path.answer": "planning.path_files.PlanResult",
+    "predict-path.answer": "planning.path_files.PathResult",
+    "preflight.answer": "pipeline.preflight.Preflight",
+    "prune.answer": "pipeline.prune.Pruned",
+    "reproduce.answer": "experiment.reproduction.Reproduction",
+    "route-graph.answer": "planning.route_graph.RouteGraphResult",
+    "simulate.answer": "simulation.SimulatedSite",
+    "status.answer": "pipeline.status.Status",
+    "train.answer": "learning.training.TrainResult",
+    "verify.answer": "pipeline.verify.Verified",
+}
+"""The dataclass of each document and of each answer of ``--json``, by the name of its schema."""
+
+
+def json_output_types() -> dict[str, type]:
+    """Return the dataclass of every document and answer of ``--json``, by the name of its schema."""
+    homes = {name: f"tcpipe.{path}".rpartition(".") for name, path in _ANSWERS.items()}
+    return {name: getattr(import_module(module), cls) for name, (module, _, cls) in homes.items()}
