@@ -23,7 +23,7 @@ from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.atomic import make_scratch_directory, make_unique_name
 from tcpipe.formats.integrity import Checksum, Checksums, compute_short_digest
 from tcpipe.formats.json_files import parse_json, parse_typed, parse_typed_json, to_json
-from tcpipe.formats.object_storage import is_bucket
+from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.place import Entry, Place, open_place
 
 CARDS = ("dataset.json", "model.json", "cost-map.json")
@@ -115,6 +115,16 @@ def write_output(url: str, card: str) -> Iterator[Path]:
     entries = place.entries()
     pointers = list(_iterate_pointers(place, [entry.name for entry in entries]))
     place.map(place.delete, _find_expired(entries, pointers))
+
+
+@contextmanager
+def open_output(out: str | Path, card: str) -> Iterator[Path]:
+    """Yield the directory to write an output into: ``out`` itself, or of a URL one whose files become its newest build."""
+    if not is_url(out):
+        yield Path(out)
+        return
+    with write_output(str(out), card) as directory:
+        yield directory
 
 
 def find_unlisted_files(url: str) -> list[str]:

@@ -162,6 +162,26 @@ def compute_label_floor(
     return {quantity: _group_by_class(partial(compute_rows, quantity), class_ids, names) for quantity in deviations}
 
 
+PATH_M = 30
+"""Length of the paths by whose sums a model is judged, in samples of about a metre."""
+
+
+def compute_path_error(
+    predicted: Array, measured: Array, runs: NDArray[np.generic], start_ns: NDArray[np.generic]
+) -> float:
+    """Return the error of sums over consecutive paths of `PATH_M` samples of a run [%]: root mean square, over the mean sum.
+
+    All arrays have shape (N,); the rest of a run counts as a path if it is its only one.
+    """
+    order, sums = np.lexsort((start_ns, runs)), list[tuple[float, float]]()
+    for rows in np.split(order, np.flatnonzero(runs[order][1:] != runs[order][:-1]) + 1):
+        for path in np.array_split(rows, max(len(rows) // PATH_M, 1)):
+            sums.append((float(predicted[path].sum()), float(measured[path].sum())))
+    said, true = np.array(sums).T
+    size = float(np.abs(true).mean())
+    return 100.0 * float(np.sqrt(np.mean((said - true) ** 2))) / size if size else 0.0
+
+
 def compute_costs(power_watt: Array, velocity_mps: Array, chord_m: float) -> dict[str, Array]:
     """Return w, v, T = d / v and E = w d / v."""
     w, v = np.asarray(power_watt, np.float64), np.asarray(velocity_mps, np.float64)

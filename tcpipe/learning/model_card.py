@@ -26,7 +26,7 @@ from tcpipe.terrain.layers import PAPER_LAYERS, make_paper_layers
 
 KIND = "tcpipe model"
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """Version of model.json and the files next to it."""
 
 

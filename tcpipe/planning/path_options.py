@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 _ORIGIN = Option(
-    "Origin of the map frame of Nav2, as navsat_transform's datum (default: that of the map's CRS).",
+    "Origin of the map frame of Nav2, whose axes are true east and north (default: the plane of the map's CRS).",
     ("--origin",), "lonlat",
 )  # fmt: skip
 

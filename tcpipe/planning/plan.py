@@ -24,7 +24,8 @@ from tcpipe.errors import ModelError, PathError
 from tcpipe.formats.json_files import convert_record
 from tcpipe.planning.cost_grid import BARRED, COURSES, LazyCostGrid, Mask
 from tcpipe.planning.cost_model import Reason
-from tcpipe.planning.path_cost import PathCost, PathTotals, compute_path_cost, describe_off_map, find_projection
+from tcpipe.planning.frames import find_projection
+from tcpipe.planning.path_cost import PathCost, PathTotals, compute_path_cost, describe_off_map
 from tcpipe.planning.search import (
     LeastCostPath,
     Steps,

@@ -15,8 +15,9 @@ from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.geojson import make_line_feature, read_line
 from tcpipe.formats.json_files import write_json
 from tcpipe.planning.cost_map import make_cost_map
-from tcpipe.planning.path_files import make_summary_path, plan, predict_path
+from tcpipe.planning.path_files import find_doubts, make_summary_path, plan, predict_path
 from tcpipe.planning.path_options import PlanPathOptions
+from tcpipe.tables.findings import Subject
 
 MODEL = PhysicsModel(patch_px=8)
 
@@ -71,6 +72,28 @@ def test_a_second_call_does_nothing_until_something_changes(source, path):
     out.write_text(out.read_text()[:-30])
     assert predict_path(MODEL, source, path, out).status == "done"
     assert predict_path(replace(MODEL, checksum="1" * 64), source, path, out).status == "done"
+
+
+def test_a_way_there_and_back_is_one_path(source, tmp_path):
+    request = _request(source, objective="distance", cell_size_m=2.0, out=tmp_path / "plan.geojson", round_trip=True)
+    found = plan(MODEL, source, request)
+    both = predict_path(MODEL, source, tmp_path / "plan.geojson", None)
+    ways = found.plans["distance"].length_m, found.together.back.length_m
+    assert both.length_m == pytest.approx(sum(ways), rel=1e-3)
+    assert both.energy_joule == pytest.approx(found.together.energy_joule, rel=0.02)
+    _write_path(tmp_path / "one.geojson", lonlat(source, (3.0, 12.0), (20.0, 14.0)))
+    apart = json.loads((tmp_path / "one.geojson").read_text())
+    apart["features"] *= 2
+    (tmp_path / "apart.geojson").write_text(json.dumps(apart))
+    with pytest.raises(PathError, match="of which one does not begin where another ends"):
+        predict_path(MODEL, source, tmp_path / "apart.geojson", None)
+
+
+def test_bends_on_trusted_ground_are_no_warning(source, tmp_path):
+    _write_path(tmp_path / "bend.geojson", lonlat(source, (4.0, 4.0), (8.5, 4.0), (8.5, 8.0)))
+    found = predict_path(MODEL, source, tmp_path / "bend.geojson", None)
+    assert found.reasons == {"curved": 1}
+    assert [of.severity for of in find_doubts(found, Subject("file", "bend"))] == ["note"]
 
 
 def test_a_path_that_leaves_the_map_is_done_in_part(source, tmp_path):
