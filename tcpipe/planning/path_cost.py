@@ -16,8 +16,8 @@ from tcpipe.cost.adaptation import Adapted, Metres, Run, adapt, predict
 from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
+from tcpipe.formats.geojson import make_line_feature
 from tcpipe.formats.json_files import write_json
-from tcpipe.formats.parquet import write_table
 from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.learning.models import Model
 from tcpipe.path import find_cuts
@@ -303,27 +303,26 @@ PATH_SEGMENTS = TableSchema(
     ),
 )  # fmt: skip
 
-ENDINGS = (".csv", ".parquet", ".json")
-
 
 def check_ending(path: Path) -> None:
-    """Raise `UsageError` unless a table can be written to a file of this name."""
-    if path.suffix.lower() not in ENDINGS:
-        raise UsageError(f"{path}: expected a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
-    if path.is_dir():
-        raise UsageError(f"{path}: is a directory, expected a file")
+    """Raise `UsageError` unless a table of path segments can be written to a file of this name."""
+    if path.suffix.lower() not in {".csv", ".geojson"} or path.is_dir():
+        raise UsageError(f"{path}: expected the name of a file that ends in .csv or .geojson")
 
 
 def write_path_segments(path: Path, table: pa.Table) -> None:
-    """Write the table in the format of the file's ending, whole or not at all."""
-    match path.suffix.lower():
-        case ".parquet":
-            write_table(table, path)
-        case ".json":
-            write_json(path, {"path_segments": table.to_pylist()})
-        case _:
-            with write_atomic_file(path) as temporary:
-                csv.write_csv(table, temporary)
+    """Write the table as CSV, or as GeoJSON of a line each, whole or not at all."""
+    if path.suffix.lower() == ".csv":
+        with write_atomic_file(path) as temporary:
+            csv.write_csv(table, temporary)
+        return
+    lines = [
+        make_line_feature(
+            np.array([[row[f"{end}_{axis}_deg"] for axis in ("lon", "lat")] for end in ("start", "end")]), row
+        )
+        for row in table.to_pylist()
+    ]
+    write_json(path, {"type": "FeatureCollection", "features": lines})
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ class PredictPathOptions:
     _: KW_ONLY
     map_name: str | None = option(None, MAP)
     out: str | Path | None = option(
-        None, Option("Write the table of path segments: .csv, .parquet or .json.", (), "output_file", "FILE")
+        None, Option("Write the table of path segments: .csv or .geojson.", (), "output_file", "FILE")
     )
     physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
