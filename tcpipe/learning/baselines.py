@@ -74,7 +74,9 @@ def compare_baselines(
                 found_there = found_there.add_unknown_power()
             theirs = Predicted.centre(residuals, found_there, class_ids, ours.card.chord_m)
             if {kind, KIND_OF_BASELINE.get(name)} == {"linear", "physics"}:  # they share their curve of speed
-                theirs = Predicted({quantity: theirs.costs[quantity] for quantity in "wE"}, {})
+                theirs = Predicted(
+                    {quantity: costs for quantity, costs in theirs.costs.items() if quantity in "wE"}, {}
+                )
             found += compare_with_baseline(name, split, part, said[split], theirs, block_m=block_m, seed=seed)
     return found, lacking
 
@@ -166,14 +168,16 @@ class BaselineResult:
     """That the intervals were drawn from."""
     drawn_by: Literal["runs", "blocks"]
 
+    @property
+    def is_beaten(self) -> bool:
+        """Whether the model is significantly better."""
+        return self.rmse_ratio.high is not None and self.rmse_ratio.high < 1.0
 
-@dataclass(frozen=True, slots=True)
-class ModelRank:
-    """How a model compares with the baselines, of which ``best`` has the smallest RMSE."""
-
-    best: BaselineResult
-    beats_all: bool
-    is_worse: bool
+    @property
+    def is_better(self) -> bool:
+        """Whether the model is significantly worse."""
+        low, value = self.rmse_ratio.low, self.rmse_ratio.value
+        return low is not None and low > 1.0 and (value or 0.0) > _MOST_EQUAL
 
 
 def describe_ratios(found: Sequence[BaselineResult]) -> list[str]:
@@ -181,21 +185,16 @@ def describe_ratios(found: Sequence[BaselineResult]) -> list[str]:
     lines = []
     for split in SPLITS:
         for quantity, called in (("E", "energy E"), ("T", "time T")):
-            if (rank := rank_model(found, split, quantity)) is not None:
-                ratio, groups = rank.best.rmse_ratio, f"{rank.best.groups} {rank.best.drawn_by}"
+            if (row := find_best(found, split, quantity)) is not None:
+                ratio, groups = row.rmse_ratio, f"{row.groups} {row.drawn_by}"
                 few = f"{groups} are too few for an interval"
                 interval = few if ratio.low is None else f"95 % CI {ratio.low:.2f} to {ratio.high:.2f}, {groups}"
-                best = f"RMSE ratio to '{rank.best.baseline}', the best baseline, {ratio.value:.2f}"
+                best = f"RMSE ratio to '{row.baseline}', the best baseline, {ratio.value:.2f}"
                 lines.append(f"{split}, {called}: {best} ({interval})")
     return lines
 
 
-def rank_model(found: Sequence[BaselineResult], split: str, quantity: str) -> ModelRank | None:
-    """Return how the model compares in a quantity of a split; None where no ratio is known."""
+def find_best(found: Sequence[BaselineResult], split: str, quantity: str) -> BaselineResult | None:
+    """Return the baseline with the smallest RMSE of a quantity of a split; None where no ratio is known."""
     rows = [row for row in found if (row.split, row.quantity) == (split, quantity) and row.rmse_ratio.value is not None]
-    if not rows:
-        return None
-    best = min(rows, key=lambda row: row.errors.rmse or 0.0)
-    ratio = best.rmse_ratio
-    worse = ratio.low is not None and ratio.low > 1.0 and (ratio.value or 0.0) > _MOST_EQUAL
-    return ModelRank(best, ratio.high is not None and ratio.high < 1.0, worse)
+    return min(rows, key=lambda row: row.errors.rmse or 0.0, default=None)

@@ -24,7 +24,7 @@ from tcpipe.learning.baselines import (
     SPLITS,
     BaselineResult,
     compare_baselines,
-    rank_model,
+    find_best,
 )
 from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import (
@@ -466,14 +466,13 @@ def _find_large_errors(part: SplitErrors, subject: Subject) -> Iterator[Finding]
 
 def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
     """Yield that the model does not beat the best baseline in energy."""
-    rank = rank_model(found.baselines, subject.name, "E")
-    if rank is None or rank.beats_all:
+    best = find_best(found.baselines, subject.name, "E")
+    if best is None or best.is_beaten:
         return
-    names = {"baseline": rank.best.baseline}
-    kind = KIND_OF_BASELINE.get(rank.best.baseline)
-    is_other = rank.is_worse and kind not in {None, found.model.training.kind}
+    names, kind = {"baseline": best.baseline}, KIND_OF_BASELINE.get(best.baseline)
+    is_other = best.is_better and kind not in {None, found.model.training.kind}
     remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if is_other else []
-    ratio = rank.best.rmse_ratio.value or 0.0
+    ratio = best.rmse_ratio.value or 0.0
     yield make_finding("baseline-not-beaten", subject, names=names, remedies=remedies, rmse_fraction=ratio)
 
 

@@ -9,7 +9,7 @@ from made_models import CARD, made_comparison
 
 from tcpipe.cost.prediction_errors import make_residuals
 from tcpipe.dataset import Split, open_dataset
-from tcpipe.learning.baselines import BASELINES, _group_samples, compare_baselines, describe_ratios, rank_model
+from tcpipe.learning.baselines import BASELINES, _group_samples, compare_baselines, describe_ratios, find_best
 from tcpipe.learning.metrics import Ratio, compute_costs
 from tcpipe.learning.models import Model
 from tcpipe.learning.predictions import Predicted, collect_measured
@@ -93,18 +93,18 @@ def test_the_best_baseline_is_named_with_the_ratio_and_its_interval():
     assert describe_ratios([mean, linear]) == [
         "unseen, energy E: RMSE ratio to 'class and slope, linear', the best baseline, 0.90 (95 % CI 0.80 to 0.97, 34 runs)"
     ]
-    assert rank_model([mean, linear], "unseen", "E").beats_all
+    assert find_best([mean, linear], "unseen", "E").is_beaten
     trees = made_comparison("gradient boosting", Ratio(1.25, 1.1, 1.4), rmse=4.0)
-    worse = rank_model([mean, linear, trees], "unseen", "E")
-    assert (worse.best, worse.beats_all, worse.is_worse) == (trees, False, True)
+    worse = find_best([mean, linear, trees], "unseen", "E")
+    assert (worse, worse.is_beaten, worse.is_better) == (trees, False, True)
     alike = made_comparison("class and slope, spline", Ratio(1.02, 0.95, 1.1), rmse=4.5)
-    same = rank_model([mean, alike], "unseen", "E")
-    assert (same.beats_all, same.is_worse) == (False, False)
+    same = find_best([mean, alike], "unseen", "E")
+    assert (same.is_beaten, same.is_better) == (False, False)
     rounded = made_comparison("physics", Ratio(1.0001, 1.00005, 1.0002), rmse=4.5)
-    assert not rank_model([mean, rounded], "unseen", "E").is_worse
+    assert not find_best([mean, rounded], "unseen", "E").is_better
     few = made_comparison("physics", Ratio(0.5, None, None), rmse=5.0)
     assert "34 runs are too few" in describe_ratios([few])[0]
-    assert not rank_model([few], "unseen", "E").beats_all
+    assert not find_best([few], "unseen", "E").is_beaten
     assert describe_ratios([made_comparison("physics", Ratio(None, None, None), rmse=5.0)]) == []
 
 
