@@ -36,6 +36,9 @@ from scipy.special import ndtr, ndtri, stdtrit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Classes = NDArray[np.integer]
+Stated = Floats | float | None
+Near = NDArray[np.bool_] | None
 Residuals = Mapping[str, NDArray[np.generic]]
 
 COVERAGE = 0.9
@@ -139,16 +142,10 @@ class Errors:
     near: Errors | None = None
     """Errors near training ground, the others being away from it; None where too few held-out samples are near others."""
 
-    def compute_std(
-        self,
-        predicted: Floats,
-        class_id: NDArray[np.integer],
-        stated: Floats | float | None = None,
-        is_near: NDArray[np.bool_] | None = None,
-    ) -> Floats:
+    def compute_std(self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None) -> Floats:
         """Return the standard deviation of each prediction, shape (N,).
 
-        ``stated`` is that by the model, None: as usual; ``is_near``, shape (N,), says what is near training ground, None: nothing.
+        ``stated`` is that by the model, None: as usual; ``is_near``, shape (N,), what is near training ground, None: nothing.
         """
         own = self.stated_share * (self.usual_stated if stated is None else stated)
         std = np.asarray((self.floor + self.share * np.abs(predicted) + own) * self.of_class[class_id])
@@ -157,11 +154,7 @@ class Errors:
         return np.where(is_near, self.near.compute_std(predicted, class_id, stated), std)
 
     def compute_intervals(
-        self,
-        predicted: Floats,
-        class_id: NDArray[np.integer],
-        stated: Floats | float | None = None,
-        is_near: NDArray[np.bool_] | None = None,
+        self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None
     ) -> tuple[Floats, Floats]:
         """Return the interval of each path segment, shape (N,) each."""
         spread, near = self.compute_std(predicted, class_id, stated, is_near), self.near or self
@@ -170,11 +163,7 @@ class Errors:
         return predicted + low * spread, predicted + high * spread
 
     def compute_sum(
-        self,
-        predicted: Floats,
-        class_id: NDArray[np.integer],
-        stated: Floats | float | None = None,
-        is_near: NDArray[np.bool_] | None = None,
+        self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None
     ) -> SumDistribution:
         """Return the distribution of the sum over segments of about a metre, in order along the path; shape (N,), NaN counts as none."""
         known = np.isfinite(predicted)

@@ -28,7 +28,7 @@ from tcpipe.learning.baselines import SPLITS
 from tcpipe.learning.evaluation import EvaluateConfig, Evaluation, PlantCosts
 from tcpipe.learning.evaluation_files import SAMPLES, run_evaluation
 from tcpipe.learning.fitting import FitConfig, ModelKind
-from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Ratio
+from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Ratio, mean_known
 from tcpipe.learning.predictions import compute_cost_errors, make_column_name
 from tcpipe.learning.predictor import find_kind
 from tcpipe.learning.training import train
@@ -192,16 +192,11 @@ def _summarize(  # noqa: PLR0917
                     dataset=name, split=split, kind=kind, quantity=quantity, terrain=terrain,
                     rmse=estimate_rmse(off[:, rows], runs[rows]),
                     mape_percent=100.0 * float(np.mean(np.abs(off[:, large]) / label[large])) if large.any() else None,
-                    coverage_percent=_mean([each.coverage_percent for each in found]) if is_all else None,
-                    crps=_mean([each.crps for each in found]) if is_all else None,
+                    coverage_percent=mean_known(each.coverage_percent for each in found) if is_all else None,
+                    crps=mean_known(each.crps for each in found) if is_all else None,
                     largest_r2=max(1.0 - (floor / spread) ** 2, 0.0) if is_all and spread else None,
                     seeds=len(made), training_s=training_s,
                 )  # fmt: skip
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
 
 
 def estimate_rmse(off: NDArray[np.float64], runs: NDArray[np.str_]) -> Ratio:

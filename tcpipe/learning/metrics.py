@@ -102,12 +102,13 @@ _SCORES = tuple(entry.name for entry in fields(Errors))[4:]
 def average_draws(draws: Iterable[Errors]) -> Errors:
     """Return the mean errors of the same samples under several draws of noise."""
     found = list(draws)
-    rmse, mape = _mean(draw.rmse for draw in found), _mean(draw.mape_percent for draw in found)
-    scores = (_mean(getattr(draw, name) for draw in found) for name in _SCORES)
+    rmse, mape = mean_known(draw.rmse for draw in found), mean_known(draw.mape_percent for draw in found)
+    scores = (mean_known(getattr(draw, name) for draw in found) for name in _SCORES)
     return Errors(found[0].count, rmse, mape, found[0].mape_count, *scores)
 
 
-def _mean(values: Iterable[float | None]) -> float | None:
+def mean_known(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are known; None of none."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 

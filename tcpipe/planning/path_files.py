@@ -124,11 +124,10 @@ def find_doubts(totals: PathTotals, path: Subject) -> Iterator[Finding]:
     """Yield where the model has no support on a path, and how little its intervals rest on."""
     for reason, count in totals.reasons.items():
         names, total = {"reason": reason.replace("_", " ")}, totals.path_segments
-        severity: Severity | None = (
-            "note" if reason == flag_name(Reason.CURVED) else None
-        )  # turns have costs of their own
+        # turns have costs of their own
+        grade: Severity | None = "note" if reason == flag_name(Reason.CURVED) else None
         yield make_finding(
-            "path-not-supported", path, severity=severity, names=names, segment_count=count, total_count=total
+            "path-not-supported", path, severity=grade, names=names, segment_count=count, total_count=total
         )
     if totals.duration_interval_s is None:
         yield make_finding("no-intervals", path)
