@@ -25,17 +25,18 @@ from tcpipe.errors import TcpipeError
 from tcpipe.learning.fitting import FitConfig, ModelKind
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, compute_costs
 from tcpipe.learning.predictor import KINDS, Job, Samples, find_kind, predict_samples
-from tcpipe.learning.training import Variant, choose_kind, make_samples, select_train
+from tcpipe.learning.training import choose_kind, make_samples, select_train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 
 
 def make_subset(data: Dataset, name: ModelKind | Literal["auto"], count: int, seed: int) -> tuple[ModelKind, Samples]:
     """Return the kind, chosen where it is ``auto``, and so many training samples for it."""
-    config, train = FitConfig(model=name, seed=seed), select_train(data, Variant())
+    config = FitConfig(model=name, seed=seed)
+    train = select_train(data, config)
     train = train.take(np.sort(np.random.default_rng(seed).permutation(len(train))[:count]))
-    chosen = choose_kind(data, config, Variant(), train) if name == "auto" else name
-    return chosen, make_samples(data, config, Variant(), find_kind(chosen), train)
+    chosen = choose_kind(data, config, train) if name == "auto" else name
+    return chosen, make_samples(data, config, find_kind(chosen), train)
 
 
 def measure(data: Dataset, name: str, count: int, seed: int) -> dict[str, tuple[float, float]]:

@@ -1,6 +1,6 @@
 """What a layer of the user's own is worth: RMSE of E and T on drives that were not fitted, with it, with noise, and without.
 
-    python benchmarks/own_layers.py OUT [--drives 12] [--hidden-variance 4] [--bands 8] [--kinds boosting]
+    python benchmarks/own_layers.py OUT [--drives 12] [--bands 8] [--kinds boosting]
 
 The small simulated site has a rolling resistance that no raster shows. `informed` has bands that are mixtures of it and of two fields that
 cost nothing; `noise` has as many random bands. Both are rasters of 0.5 m, added with ``add-map --layer``; whole drives are held out.
@@ -26,7 +26,6 @@ from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import find_scenario
-from tcpipe.simulation.scenarios import scale_hidden_variance
 from tcpipe.simulation.world import World, draw_waves, sum_waves
 from tcpipe.terrain.target_grid import MapGrid
 
@@ -50,10 +49,10 @@ def make_bands(world: World, count: int, rng: np.random.Generator) -> dict[str, 
     return {"informed": (mixed + 0.1 * noise).astype(np.float32), "noise": noise.astype(np.float32)}
 
 
-def build(out: Path, drives: int, variance: float, bands: int) -> Path:
+def build(out: Path, drives: int, bands: int) -> Path:
     """Return a dataset of the simulated drives, with both layers."""
-    site = simulate_drives(out / "site", drives, _METRES, seed=0, hidden_variance=variance)
-    made = scale_hidden_variance(find_scenario("paper_quick").world, variance)
+    site = simulate_drives(out / "site", drives, _METRES, seed=0)
+    made = find_scenario("paper_quick").world
     world = made.site
     rasters = {}
     for name, values in make_bands(made, bands, np.random.default_rng(7)).items():
@@ -90,11 +89,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--drives", type=int, default=12)
-    parser.add_argument("--hidden-variance", type=float, default=4.0)
     parser.add_argument("--bands", type=int, default=8)
     parser.add_argument("--kinds", nargs="*", default=["boosting"])
     told = parser.parse_args()
-    dataset = build(told.out, told.drives, told.hidden_variance, told.bands)
+    dataset = build(told.out, told.drives, told.bands)
     for kind in told.kinds:
         for more in ((), ("informed",), ("noise",)):
             name = "+".join(("paper", *more))

@@ -7,7 +7,7 @@ built into a dataset, a model is trained on the first drives; the further ones, 
 `tcpipe evaluate --drive` does; all of it for --models seeds. Paths follow one another along a drive. Coverage is of the measured labels,
 over all drives, with its 95 % interval (binomial, clustered by drive: `tcpipe.cost.coverage`); 90 is to be inside. With --payload the
 further drives carry so many kg more. The line of budgets is of paths there and back: two consecutive parts of a drive. The second table
-predicts the rest of each further drive of the last seed after its first metres adapt the model, beside the mean of these metres.
+predicts the rest of each further drive of the last seed after its first metres adapt the model.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tcpipe.cost.adaptation import Metres, Run, compare_adaptations, format_adaptations, predict
+from tcpipe.cost.adaptation import Metres, Run, compare_adaptations, predict
 from tcpipe.cost.coverage import measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE, Errors
 from tcpipe.learning.fitting import FitConfig
@@ -33,19 +33,15 @@ from tcpipe.planning.drives import collect_runs
 from tcpipe.planning.path_files import RISK, choose_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import SimulatedSite, find_scenario, simulate
-from tcpipe.simulation.scenarios import scale_hidden_variance
 from tcpipe.store import open_store
 
 LENGTHS = (1, 10, 30, 100)
 KNOWN_M = (0.0, 10.0, 50.0, 100.0)
 
 
-def simulate_drives(
-    place: Path, count: int, metres: float, *, seed: int, payload_kg: float = 0.0, hidden_variance: float = 1.0
-) -> SimulatedSite:
-    """Simulate drives over the small site, whose rolling resistance that no raster shows has so many times its variance."""
+def simulate_drives(place: Path, count: int, metres: float, *, seed: int, payload_kg: float = 0.0) -> SimulatedSite:
+    """Simulate drives over the small site."""
     site = find_scenario("paper_quick")
-    site = replace(site, world=scale_hidden_variance(site.world, hidden_variance))
     robot = site.drives[0].robot
     robot = replace(robot, mass_kg=robot.mass_kg + payload_kg)
     drives = tuple(
@@ -152,7 +148,7 @@ def main() -> None:
     print(format_budget(found))
     known_m = [metres for metres in KNOWN_M if metres <= given.metres / 3.0]
     both = {quantity: errors[quantity] for quantity in ("energy", "duration")}
-    print(*format_adaptations(list(compare_adaptations(both, runs, known_m))), sep="\n")
+    print(*compare_adaptations(both, runs, known_m), sep="\n")
 
 
 if __name__ == "__main__":

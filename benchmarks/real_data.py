@@ -28,11 +28,12 @@ from dataclasses import dataclass, fields, replace
 from itertools import permutations
 from pathlib import Path
 
+import lightgbm
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe import ingest
-from tcpipe.cost.adaptation import MODEL, Metres, Run, compare_adaptations
+from tcpipe.cost.adaptation import Metres, Run, compare_adaptations
 from tcpipe.cost.physics import ALL, FitSamples, fit_physics
 from tcpipe.cost.prediction_errors import Errors as PredictionErrors
 from tcpipe.cost.prediction_errors import fit_bias_correction, fit_errors
@@ -132,8 +133,14 @@ def by_trees(of: Metre) -> Predictor:
         return np.column_stack([there.rise, there.turn_radpm, there.command])
 
     labels = np.column_stack([of.power, of.velocity])
-    forest, _ = grow(features(of), labels, np.ones_like(labels), _folds(len(labels)))
-    return lambda there: np.maximum(forest.predict(features(there)), [-np.inf, LEAST_VELOCITY_MPS])
+    texts, _, _ = grow(features(of), labels, np.ones_like(labels), _folds(len(labels)))
+    trees = [lightgbm.Booster(model_str=text) for text in texts]
+
+    def predict(there: Metre) -> Floats:
+        outputs = np.column_stack([tree.predict(features(there)) for tree in trees])
+        return np.maximum(outputs, [-np.inf, LEAST_VELOCITY_MPS])
+
+    return predict
 
 
 MODELS = {"mean": by_mean, "mean power": by_mean_power, "physics": by_physics, "boosted trees": by_trees}
@@ -186,7 +193,7 @@ def adapted_lines(name: str, other: str, known: Metre, there: Metre) -> Iterator
     """Yield E of a drive's rest by models of another, after its first metres adapt them."""
     known_m = [metres for metres in ADAPTED_M if 2 * metres <= len(there.power)]
     ones = np.ones_like(there.power)
-    for model in ("mean", "physics", "boosted trees"):
+    for model in ("physics", "boosted trees"):
         said, errors = centred(MODELS[model], known, there)
         metres = Metres(
             said["E"], there.power / there.velocity, np.zeros(len(ones), np.int64), np.cumsum(ones) - 1.0, ones, said["T"],
@@ -194,13 +201,11 @@ def adapted_lines(name: str, other: str, known: Metre, there: Metre) -> Iterator
         )  # fmt: skip
         runs = [Run(name, {"energy": metres})]
         for of in compare_adaptations({"energy": errors["energy"]}, runs, known_m):
-            if of.predictor == MODEL or model == "mean":
-                who = model if of.predictor == MODEL else "mean of the known metres"
-                r2 = 1.0 - of.rmse**2 / float(np.var(metres.measured[-of.samples :]))
-                yield (
-                    f"| {name} by {other} | {who} | {of.metres:g} | {of.samples} | {of.rmse:.0f} J | {r2:.2f} "
-                    f"| {of.coverage_percent:.0f} | {of.total_error_percent:.0f} | {'yes' if of.totals_inside else 'no'} |"
-                )
+            r2 = 1.0 - of.rmse**2 / float(np.var(metres.measured[-of.samples :]))
+            yield (
+                f"| {name} by {other} | {model} | {of.metres:g} | {of.samples} | {of.rmse:.0f} J | {r2:.2f} "
+                f"| {of.coverage_percent:.0f} | {of.total_error_percent:.0f} | {'yes' if of.totals_inside else 'no'} |"
+            )
 
 
 def by_blocks(fit: Callable[[Metre], Predictor], of: Metre) -> Told:

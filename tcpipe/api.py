@@ -14,9 +14,9 @@ from tcpipe.planning.path_options import PlanPathOptions, PredictPathOptions
 from tcpipe.tables.options import as_function
 
 if TYPE_CHECKING:
-    from tcpipe.learning.evaluation_files import AdaptationResult, EvaluationResult
+    from tcpipe.learning.evaluation_files import EvaluationResult
     from tcpipe.learning.training import TrainResult
-    from tcpipe.planning.drives import DrivesResult
+    from tcpipe.planning.drives import AdaptationResult, DrivesResult
     from tcpipe.planning.path_files import PathResult, PlanResult
 
 
@@ -57,34 +57,29 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
     """
     model, dataset, out, store = options.model, options.dataset, options.out, options.store
     if options.drives:
+        from tcpipe.dataset import open_dataset
         from tcpipe.learning.models import load_model
+        from tcpipe.planning.drives import check_origin, evaluate_adaptation, evaluate_drives
         from tcpipe.planning.path_files import choose_map
 
-        loaded, source = load_model(model, options.predictor), choose_map(store, options.map_name)
-    if options.adapt is not None:
-        from tcpipe.dataset import open_dataset
-        from tcpipe.learning.evaluation_files import evaluate_adaptation
-        from tcpipe.planning.drives import collect_runs
-        from tcpipe.store import open_store
-
-        runs = None
-        if options.drives:
-            logs, data = [*map(str, options.drives)], open_dataset(dataset)
-            runs = collect_runs(loaded, source, open_store(store), logs, data)
-        return evaluate_adaptation(model, dataset, out, options.adapt, runs=runs, predictor=options.predictor)
-    if options.drives:
-        from tcpipe.dataset import open_dataset
-        from tcpipe.learning.predictions import check_origin
-        from tcpipe.planning.drives import evaluate_drives
-
-        data = open_dataset(dataset)
-        check_origin(loaded.card, data, str(model))
-        return evaluate_drives(loaded, data, source, [*map(str, options.drives)], store=store, out=out)
-    from tcpipe.learning.evaluation_facts import EvaluateConfig
+        loaded, source, data = (
+            load_model(model, options.predictor),
+            choose_map(store, options.map_name),
+            open_dataset(dataset),
+        )
+        logs = [*map(str, options.drives)]
+        if options.adapt is not None:
+            return evaluate_adaptation(loaded, data, source, logs, options.adapt, store=store, out=Path(out))
+        check_origin(loaded, data)
+        return evaluate_drives(loaded, data, source, logs, store=store, out=out)
+    from tcpipe.errors import UsageError
+    from tcpipe.learning.evaluation import EvaluateConfig
     from tcpipe.learning.evaluation_files import run_evaluation
     from tcpipe.recipe.checking import from_values
 
-    asked = {name: getattr(options, name) for name in ("noise_draws", "baselines", "seed")}
+    if options.adapt is not None:
+        raise UsageError("--adapt: which runs adapt the model? name them with --drive LOG")
+    asked = {name: getattr(options, name) for name in ("noise_draws", "seed")}
     return run_evaluation(
         model, dataset, out, config=from_values(EvaluateConfig, asked, where="evaluate"), predictor=options.predictor
     )

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.learning.evaluation_facts import (
-    BaselineResult,
+from tcpipe.learning.baselines import BaselineResult
+from tcpipe.learning.evaluation import (
     EvaluateConfig,
     EvaluatedDataset,
     EvaluatedModel,
@@ -63,9 +63,11 @@ def made_model(directory: Path, *, seed: int = 0, rows: int = 60, width: int = 1
             "velocity_predicted_mps": velocity + rng.normal(0.0, 0.02, rows),
         }
     )
+    ground = pa.table({"lon_deg": np.empty(0), "lat_deg": np.empty(0)})
     write_model(
-        directory, card=card, weights=network.arrays(), residuals=residuals, history="epoch,loss\n", readme="made\n"
-    )
+        directory, card=card, weights=network.arrays(), residuals=residuals, ground=ground, history="epoch,loss\n",
+        readme="made\n",
+    )  # fmt: skip
     return directory
 
 
@@ -75,8 +77,8 @@ def made_comparison(
     """A model beside a baseline, whose errors are ``ratio`` of the baseline's."""
     errors = Errors(50, rmse, 5.0, 50)
     return BaselineResult(
-        baseline=baseline, split=split, quantity=quantity, errors=errors, rmse_ratio=ratio, uncentred=errors,
-        uncentred_rmse_ratio=ratio, groups=groups, drawn_by="runs",
+        baseline=baseline, split=split, quantity=quantity, errors=errors, rmse_ratio=ratio, groups=groups,
+        drawn_by="runs",
     )  # fmt: skip
 
 
@@ -84,6 +86,6 @@ def made_evaluation(**changes) -> Evaluation:
     """An evaluation without any figure; ``changes`` replace its fields."""
     empty = Evaluation(
         tcpipe_version="", key="", model=EvaluatedModel("", "", CARD.training), dataset=EvaluatedDataset("", "", {}),
-        config=EvaluateConfig(), splits={}, ablation=(), energy={}, time={}, repeatability={},
+        config=EvaluateConfig(), splits={}, ablation=(), time={}, repeatability={},
     )  # fmt: skip
     return replace(empty, **changes)

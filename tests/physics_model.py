@@ -87,6 +87,9 @@ class PhysicsModel:
     def errors(self):
         return fit_errors(self.residuals)
 
+    def find_near(self, lonlat_deg):
+        return np.zeros(len(lonlat_deg), np.bool_)
+
     def ask(self, patches, features=None):
         return Prediction.without_covariance(self.predict(patches, features))
 

@@ -3,7 +3,7 @@
 import numpy as np
 from map_worlds import ArrayMap
 
-from tcpipe.planning.path_cost import find_projection
+from tcpipe.planning.frames import find_projection
 from tcpipe.terrain.target_grid import MapGrid
 
 WEST_M, NORTH_M = 500_000.0, 5_200_000.0

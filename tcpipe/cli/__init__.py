@@ -45,6 +45,7 @@ _COMMANDS = {
     "check-split": ("dataset_commands", "Judge the split of any table for spatial leakage"),
     "train": ("model_commands", "Train a model on a dataset"),
     "evaluate": ("model_commands", "Evaluate a model and compare it with the paper"),
+    "benchmark": ("model_commands", "Compare all kinds of model on datasets"),
     "reproduce": ("model_commands", "Repeat the paper's experiment on a simulated site"),
     "predict-path": ("model_commands", "Predict time and energy of a path"),
     "cost-map": ("model_commands", "Compute directional cost maps of a whole map"),

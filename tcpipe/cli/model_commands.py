@@ -14,8 +14,11 @@ from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions, RouteGraphOptions
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from tcpipe.experiment.reproduction import Size
     from tcpipe.formats.maps.map_files import MapFile
+    from tcpipe.learning.fitting import ModelKind
     from tcpipe.learning.models import Model
 
 
@@ -24,10 +27,11 @@ if TYPE_CHECKING:
 @json_option
 @quiet_option
 def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:
-    """Train a model on DATASET: ResNet-18 with early stopping on a fold of train, boosted trees, or physics; write it to the folder OUT.
+    """Train a model on DATASET and write it to the folder OUT.
 
-    Needs an extra: pip install 'tcpipe[train]', or 'tcpipe[tables]' for boosting. A network uses a GPU if there is one; an interrupted
-    training resumes.
+    Without options: the simplest of curves, physics and boosted trees that predicts other runs as well as the best. --model resnet18,
+    or an option of it, trains the paper's network. Boosted trees need pip install 'tcpipe[tables]', a network 'tcpipe[train]'; it uses
+    a GPU if there is one, and an interrupted training resumes.
     """
     from tcpipe.api import run_train
 
@@ -44,20 +48,57 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
     """Evaluate MODEL on DATASET's test samples and unseen area, and write evaluation.json and .html to OUT.
 
     RMSE and MAPE of power, velocity, time and energy by terrain class; baselines, centred by the same rule; the coverage of intervals;
-    the ablation of the input layers; networks of each class, those of Wei and Isler, and the expected time; the noise floor of the
-    labels; all with the values of the paper. OUT keeps the networks that the command trains, for the next call; predictions.parquet has
-    every prediction. OUT may be a URL in a bucket, where each evaluation is a folder of its own.
+    the ablation of the input layers; the expected time; the noise floor of the labels; all with the values of the paper.
+    predictions.parquet has every prediction. OUT may be a URL in a bucket, where each evaluation is a folder of its own.
 
     With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals, in drives.json of OUT;
     DATASET, which MODEL was trained on, shows whether a drive was held back.
 
-    With --adapt: errors and coverage on the rest of each run after its first metres adapt MODEL, in adaptation.json of OUT; DATASET may
-    be of another robot.
+    With --drive and --adapt: errors and coverage on the rest of each drive after its first metres adapt MODEL, in adaptation.json
+    of OUT; the drives may be of another robot.
     """
     from tcpipe.api import run_evaluate
 
     with show_progress("evaluate", quiet=quiet):
         result = run_evaluate(options)
+    if as_json:
+        print_json(result.values)
+    else:
+        print_lines(result)
+
+
+@click.command()
+@click.argument(
+    "datasets", nargs=-1, required=True, type=click.Path(exists=True, file_okay=False), metavar="DATASET..."
+)
+@click.option(
+    "--kinds", multiple=True, type=click.Choice(["linear", "physics", "boosting", "resnet18"]),
+    help="Kind of model; repeatable (default: all).",
+)  # fmt: skip
+@click.option("--seeds", default=5, type=click.IntRange(1, 100), help="Trainings of each network.")
+@click.option("--out", default="benchmark", type=OUTPUT_DIRECTORY, help="Where tables, models and evaluations go.")
+@click.option("--predictor", metavar="FILE.py[:NAME]", help="Your own model, which joins the kinds.")
+@json_option
+@quiet_option
+def benchmark(
+    datasets: Sequence[str],
+    *,
+    kinds: Sequence[ModelKind],
+    seeds: int,
+    out: str,
+    predictor: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Train and evaluate every kind of model on every DATASET, and print the paper's table of each.
+
+    RMSE and MAPE of power, velocity, energy and time by class, with 95 % intervals over runs and trainings; coverage, CRPS, training
+    time, and the largest R² that the noise of the labels allows. Writes benchmark.json and .html; an interrupted call resumes.
+    """
+    from tcpipe.experiment.benchmark import KINDS, run_benchmark
+
+    with show_progress("benchmark", quiet=quiet):
+        result = run_benchmark(datasets, out, kinds=kinds or KINDS, seeds=seeds, predictor=predictor)
     if as_json:
         print_json(result.values)
     else:
@@ -96,9 +137,9 @@ def reproduce(
 ) -> None:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and test the claims of the paper.
 
-    Takes some two hours a training on two cores, minutes with --size small; an interrupted call resumes. The data are
-    simulated: compare the pattern with the paper, not the numbers. Writes reproduction.html, reproduction.json and all
-    intermediate results to DIR.
+    Runs 'tcpipe benchmark' on it. Takes some two hours a training on two cores, minutes with --size small; an interrupted call
+    resumes. The data are simulated: compare the pattern with the paper, not the numbers. Writes reproduction.html,
+    reproduction.json and all intermediate results to DIR.
     """
     from tcpipe.experiment.reproduction import reproduce as run
 

@@ -17,6 +17,8 @@ Estimated are, in this order:
 * the **common error** of the labels themselves (gain and zero of the power sensor, scale of a lone odometry): held-out samples have it
   too, so that no residual shows it. It is the share of it in the sum of the labels, by the columns of their standard deviations.
 
+Ground near that of training samples has spreads, correlations and runs of its own, where enough held-out samples are of such ground.
+
 With a_i the spreads and s_i the errors of the biases, what a robot's own sensors measure on a path of costs p_i errs by
 z sqrt(sum_ij a_i a_j rho_ij + (sum_i s_i)²): less, of itself, the longer it is, and never less than a run differs from another. Sensors
 that err as they did in training do not change that. Against the true cost, which a budget is of, their c sum_i |p_i| is added.
@@ -34,6 +36,9 @@ from scipy.special import ndtr, ndtri, stdtrit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Classes = NDArray[np.integer]
+Stated = Floats | float | None
+Near = NDArray[np.bool_] | None
 Residuals = Mapping[str, NDArray[np.generic]]
 
 COVERAGE = 0.9
@@ -134,38 +139,54 @@ class Errors:
     common_share: float = 0.0
     stated_share: float = 0.0
     usual_stated: float = 0.0
+    near: Errors | None = None
+    """Errors near training ground, the others being away from it; None where too few held-out samples are near others."""
 
-    def compute_std(
-        self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
-    ) -> Floats:
-        """Return the standard deviation of each prediction, shape (N,); ``stated`` by the model, None: as usual."""
+    def compute_std(self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None) -> Floats:
+        """Return the standard deviation of each prediction, shape (N,).
+
+        ``stated`` is that by the model, None: as usual; ``is_near``, shape (N,), what is near training ground, None: nothing.
+        """
         own = self.stated_share * (self.usual_stated if stated is None else stated)
-        return np.asarray((self.floor + self.share * np.abs(predicted) + own) * self.of_class[class_id])
+        std = np.asarray((self.floor + self.share * np.abs(predicted) + own) * self.of_class[class_id])
+        if self.near is None or is_near is None:
+            return std
+        return np.where(is_near, self.near.compute_std(predicted, class_id, stated), std)
 
     def compute_intervals(
-        self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
+        self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None
     ) -> tuple[Floats, Floats]:
         """Return the interval of each path segment, shape (N,) each."""
-        spread = self.compute_std(predicted, class_id, stated)
-        return predicted + self.low * spread, predicted + self.high * spread
+        spread, near = self.compute_std(predicted, class_id, stated, is_near), self.near or self
+        flags = np.zeros(len(predicted), np.bool_) if is_near is None else is_near
+        low, high = np.where(flags, near.low, self.low), np.where(flags, near.high, self.high)
+        return predicted + low * spread, predicted + high * spread
 
     def compute_sum(
-        self, predicted: Floats, class_id: NDArray[np.integer], stated: Floats | float | None = None
+        self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None
     ) -> SumDistribution:
         """Return the distribution of the sum over segments of about a metre, in order along the path; shape (N,), NaN counts as none."""
         known = np.isfinite(predicted)
         values = np.where(known, predicted, 0.0)
-        spread = np.where(known, self.compute_std(values, class_id, stated), 0.0)
+        spread = np.where(known, self.compute_std(values, class_id, stated, is_near), 0.0)
         middle, alone = float(values.sum()), float((spread**2).sum())
         if not alone:
             return SumDistribution(middle, 0.0, 0.0)
-        variance = max(self.compute_variance(spread, self.of_run), alone / spread.size)
-        size = np.abs(values)
-        # Errors of a single metre are no normal ones, sums nearly.
-        like_one = min(variance / float(spread.sum()) ** 2, 1.0)
-        below, above = (end / NORMAL_HALF_WIDTH * like_one + (1.0 - like_one) for end in (-self.low, self.high))
-        std = float(np.hypot(np.sqrt(variance), (size * self.bias_std[class_id]).sum()))
-        return SumDistribution(middle, std * below, std * above, self.common_share * float(size.sum()))
+        size, parts = np.abs(values), [(1.0, self)]
+        if (
+            self.near is not None and is_near is not None
+        ):  # correlations are those of the ground that most of the path is on
+            share = float(is_near[known].mean())
+            parts = [(1.0 - share, self), (share, self.near)]
+        below = above = 0.0
+        for share, errors in parts:
+            variance = max(errors.compute_variance(spread, errors.of_run), alone / spread.size)
+            # Errors of a single metre are no normal ones, sums nearly.
+            like_one = min(variance / float(spread.sum()) ** 2, 1.0)
+            std = float(np.hypot(np.sqrt(variance), (size * errors.bias_std[class_id]).sum()))
+            below += share * std * (like_one * -errors.low / NORMAL_HALF_WIDTH + 1.0 - like_one)
+            above += share * std * (like_one * errors.high / NORMAL_HALF_WIDTH + 1.0 - like_one)
+        return SumDistribution(middle, below, above, self.common_share * float(size.sum()))
 
     def compute_variance(self, spread: Floats, of_run: float) -> float:
         """Return the variance sum_ij a_i a_j rho_ij of a sum over path segments of about a metre by their spreads, shape (N,).
@@ -210,12 +231,28 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
     ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted; where known
-    also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule, and the stated errors (`make_residuals`).
+    also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule, the stated errors (`make_residuals`), and
+    the predictions `NEAR` by models of other runs, of samples on ground that these drove.
     Without columns of power the errors are those of velocity and duration.
     """
     held = _Held.collect(residuals)
     if held is None:
         return None
+    away, by_runs = _fit_quantities(residuals, held), {name: residuals[name] for name in NEAR if name in residuals}
+    if not by_runs:
+        return away
+    rows = np.isfinite(by_runs[NEAR[1]].astype(np.float64))
+    close = {name: values[rows] for name, values in residuals.items() if name not in _STATED}
+    close |= {name.replace("_near", ""): values[rows] for name, values in by_runs.items()}
+    held_near = _Held.collect(close)
+    if held_near is None:
+        return away
+    near = _fit_quantities(close, held_near)
+    return {name: replace(errors, near=near[name]) for name, errors in away.items()}
+
+
+def _fit_quantities(residuals: Residuals, held: _Held) -> dict[str, Errors]:
+    """Return the errors of each quantity, centred by their own bias."""
     correction = _fit_bias_correction(held)
     power, velocity = correction.apply(held.predicted["power"], held.predicted["velocity"], held.class_id)
     predicted = {"power": power, "velocity": velocity, "duration": 1.0 / velocity, "energy": power / velocity}
@@ -240,6 +277,9 @@ def estimate_correlation(residuals: Residuals) -> float:
     both = float(np.sqrt(power.var() * velocity.var()))
     return float(np.mean((power - power.mean()) * (velocity - velocity.mean()))) / both if both else 0.0
 
+
+NEAR = "power_near_predicted_watt", "velocity_near_predicted_mps"
+"""Columns of predictions of samples on ground that other runs drove, by models of these; else NaN."""
 
 _STATED = "power_predicted_std_watt", "velocity_predicted_std_mps", "power_velocity_predicted_covariance"
 

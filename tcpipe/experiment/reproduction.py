@@ -13,22 +13,22 @@ from pathlib import Path
 from typing import Literal
 
 from tcpipe.errors import DatasetError, UsageError, clean_lines
+from tcpipe.experiment.benchmark import BenchmarkRow, list_tables, run_benchmark
+from tcpipe.experiment.networks import compare_networks
 from tcpipe.experiment.simulation_floor import FEWEST_SEEDS, Claim, check_claims, compute_true_costs
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
-from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation, SplitErrors
-from tcpipe.learning.evaluation_files import SIMULATED, run_evaluation
-from tcpipe.learning.evaluation_page import format_leakage
+from tcpipe.learning.evaluation import UNKNOWN_DISTANCE, EvaluateConfig, Evaluation
+from tcpipe.learning.evaluation_files import SIMULATED
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import ALL, UNITS
-from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.plots import draw_ratios
-from tcpipe.simulation import Scenario, SimulatedSite, find_scenario, simulate
+from tcpipe.simulation import SimulatedSite, find_scenario, simulate
 
 logger = logging.getLogger("tcpipe")
 
@@ -82,8 +82,7 @@ class ReproductionSummary:
     scenario: str
     plan: Experiment
     claims: tuple[Claim, ...]
-    seeds: tuple[Mapping[str, SplitErrors], ...]
-    """Errors by split, of each training."""
+    benchmark: tuple[BenchmarkRow, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +123,6 @@ def reproduce(
     baselines : train the networks of Wei and Isler; without them what is claimed of them is not measured.
     """
     place, plan = Path(directory), SIZES[size]
-    plan = replace(plan, evaluating=replace(plan.evaluating, baselines=baselines))
     clear(place)
     if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
         raise UsageError(f"{place}: exists and is no reproduction; give another DIR")
@@ -133,9 +131,21 @@ def reproduce(
         site = simulate(place / "site", scenario=made, seed=SIMULATION_SEED)
     with _measure_time(seconds, "ingest and build"):
         _build(place, site, jobs)
-    runs = [_train_and_evaluate(place, made, plan, seed, seconds) for seed in range(seeds)]
-    splits = tuple(run.splits for run in runs)
-    values = ReproductionSummary(scenario=plan.scenario, plan=plan, claims=tuple(check_claims(runs)), seeds=splits)
+    with _measure_time(seconds, "train and evaluate"):
+        known = partial(compute_true_costs, replace(made.world, resistance=()), made.drives[0].robot)
+        benchmark = run_benchmark(
+            [place / "dataset"], place, seeds=seeds, config=plan.fitting, evaluating=plan.evaluating, plant=known
+        )
+    runs = benchmark.evaluations["dataset", "resnet18"]
+    comparisons = [run.baselines for run in runs]
+    if baselines:
+        with _measure_time(seconds, "networks of each class"):
+            for seed, run in enumerate(runs):
+                here = place / "dataset" / f"resnet18-{seed}"
+                networks = compare_networks(here / "model", place / "dataset", here / "networks", seed=seed)
+                comparisons[seed] = (*run.baselines, *networks)
+    claims = tuple(check_claims(comparisons))
+    values = ReproductionSummary(scenario=plan.scenario, plan=plan, claims=claims, benchmark=benchmark.values.rows)
     write_json(place / JSON, values)
     write_text(place / PAGE, _render_page(values, runs))
     return Reproduction(place, values, dict(seconds))
@@ -164,29 +174,22 @@ def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
     logger.info("%s", str(built).splitlines()[0])
 
 
-def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int, seconds: Counter[str]) -> Evaluation:
-    here, dataset = place / f"seed-{seed}", place / "dataset"
-    with _measure_time(seconds, "train"):
-        train(dataset, here / "model", config=replace(plan.fitting, seed=seed))
-    with _measure_time(seconds, "evaluate"):
-        known = partial(compute_true_costs, replace(made.world, resistance=()), made.drives[0].robot)
-        config = replace(plan.evaluating, seed=seed)
-        return run_evaluation(here / "model", dataset, here / "evaluation", config=config, plant=known).values
-
-
 def _render_page(values: ReproductionSummary, runs: Sequence[Evaluation]) -> str:
     """Return the HTML page of all trainings."""
     claims = values.claims
-    audits = (f"{split}: {format_leakage(part.leakage)}" for split, part in runs[0].splits.items())
+    audits = (f"{split}: {part.leakage or UNKNOWN_DISTANCE}" for split, part in runs[0].splits.items())
+    tables = [
+        Section(title, header=header, rows=rows, folded=True) for title, header, rows in list_tables(values.benchmark)
+    ]
     return render_page(
         title="The paper's experiment on a simulated site",
-        lead="All tables of a training are in seed-N/evaluation/evaluation.html.",
+        lead="All tables of a training are in dataset/KIND-SEED/evaluation/evaluation.html.",
         numbers=[
             *(Number(f"{count} of {len(claims)}", f"claims {name}") for name, count in _count_verdicts(claims).items()),
             Number(f"{len(runs)}", "training" if len(runs) == 1 else "trainings"),
         ],
         warnings=[SIMULATED, *([values.plan.warning] if values.plan.warning else [])],
-        sections=[_make_claims_section(claims, " ".join(audits)), _make_errors_section(runs)],
+        sections=[_make_claims_section(claims, " ".join(audits)), _make_floor_section(runs), *tables],
     )
 
 
@@ -211,18 +214,16 @@ def _make_claims_section(claims: Sequence[Claim], audit: str) -> Section:
     return Section("Claims of the paper", text, header=header, rows=rows, plots=[plot])
 
 
-def _make_errors_section(runs: Sequence[Evaluation]) -> Section:
-    """Return the errors of each training above those of a predictor that knows the simulator."""
-    rows = []
-    for split, part in runs[0].splits.items():
-        for quantity in ("E", "T"):
-            found = [run.splits[split].errors[quantity][ALL] for run in runs]
-            floor = [] if part.simulation_floor is None else [part.simulation_floor[quantity][ALL]]
-            figures = (
-                f"{error.rmse:.3f} {UNITS[quantity]}, {error.mape_percent or float('nan'):.2f} %"
-                for error in (*floor, *found)
-            )
-            rows.append((split, quantity, *figures))
-    text = "The floor knows the simulator, map, path and turn without error; hidden variation and the noise of the labels remain."
-    header = ("", "", "floor", *(f"seed {number}" for number in range(len(runs))))
-    return Section("RMSE and MAPE of every training", text, header=header, rows=rows)
+def _make_floor_section(runs: Sequence[Evaluation]) -> Section:
+    """Return the errors of a predictor that knows the simulator."""
+    rows = [
+        (split, quantity, f"{error.rmse:.3f} {UNITS[quantity]}", f"{error.mape_percent or float('nan'):.2f} %")
+        for split, part in runs[0].splits.items()
+        for quantity in ("E", "T")
+        if part.simulation_floor is not None
+        for error in [part.simulation_floor[quantity][ALL]]
+    ]
+    text = (
+        "It knows the simulator, map, path and turn without error; hidden variation and the noise of the labels remain."
+    )
+    return Section("Floor of the simulation", text, header=("", "", "RMSE", "MAPE"), rows=rows)

@@ -120,6 +120,16 @@ def write_output(url: str, card: str) -> Iterator[Path]:
     place.map(place.delete, _find_expired(entries, pointers))
 
 
+@contextmanager
+def open_output(out: str | Path, card: str) -> Iterator[Path]:
+    """Yield the directory to write an output into: ``out`` itself, or of a URL one whose files become its newest build."""
+    if not is_url(out):
+        yield Path(out)
+        return
+    with write_output(str(out), card) as directory:
+        yield directory
+
+
 def find_unlisted_files(url: str) -> list[str]:
     """Return the files at a URL that no card there lists, without those of replaced builds and of builds that may be going on."""
     place = open_place(url)

@@ -1,42 +1,32 @@
-"""``tcpipe evaluate``: the paper's section V for any model and dataset, tables I to V, with the labels' own noise beside them."""
+"""The paper's section V for any model and dataset, tables I to III and V, with the labels' own noise beside them."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.cost.coverage import find_miscalibration, measure_coverage
+from tcpipe.cost.coverage import Coverage, find_miscalibration, measure_coverage
 from tcpipe.dataset import Dataset, Split, open_dataset
-from tcpipe.dataset.energies import ENERGIES, Energy
+from tcpipe.dataset.energies import ENERGIES, Energy, EnergyName
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.learning.baselines import (
-    BASELINE_OF_KIND,
-    CURVES,
-    OURS,
-    compare_baselines,
-    make_energy_table,
-    rank_model,
-)
-from tcpipe.learning.evaluation_facts import (
+    KIND_OF_BASELINE,
     SPLITS,
-    AblationRow,
-    ErrorsByClass,
-    EvaluateConfig,
-    EvaluatedDataset,
-    EvaluatedModel,
-    Evaluation,
-    Leakage,
-    SplitErrors,
+    BaselineResult,
+    compare_baselines,
+    find_best,
 )
+from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import (
     ALL,
     LEAST,
@@ -48,7 +38,9 @@ from tcpipe.learning.metrics import (
     compute_errors,
     compute_errors_by_class,
     compute_label_floor,
+    compute_path_error,
 )
+from tcpipe.learning.model_card import Training
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predictions import (
     Measured,
@@ -59,26 +51,171 @@ from tcpipe.learning.predictions import (
     predict_costs,
     predict_spreads,
 )
-from tcpipe.learning.predictor import Prediction, find_kind
-from tcpipe.learning.training import Variant, compute_dataset_checksum, select_train, train
+from tcpipe.learning.predictor import Prediction
+from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, LOCAL_PLACES, PLACES, are_near, compute_middles
-from tcpipe.tables.facts import Floor
-from tcpipe.tables.findings import Finding, Remedy, Subject, judge, make_finding, read_threshold
+from tcpipe.tables.bounds import Bounds
+from tcpipe.tables.facts import ABSENT, Floor
+from tcpipe.tables.findings import (
+    PREDICTED,
+    Affected,
+    Finding,
+    Remedy,
+    Severity,
+    Subject,
+    Verdict,
+    judge,
+    make_finding,
+    read_threshold,
+)
 from tcpipe.terrain.layers import NODATA_ID
 
 logger = logging.getLogger("tcpipe")
 
-NETWORKS = "networks"
-"""Folder of the networks that an evaluation trains."""
+KIND = "tcpipe evaluation"
+
+ErrorsByClass: TypeAlias = Mapping[str, Mapping[str, Errors]]
+"""By quantity, then by the name of a class, or `tcpipe.learning.metrics.ALL`."""
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateConfig:
+    """How much is evaluated."""
+
+    noise_draws: Annotated[int, Bounds(ge=1, le=1000)] = 5
+    """Draws of noise that each ablated input set is the mean of."""
+    seed: Seed = 0
+    """Of the noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedModel:
+    """Which model was evaluated."""
+
+    name: str
+    checksum: str
+    training: Training
+    label_energy: EnergyName = "total"
+    """Which power and energy it predicts, and was measured by."""
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedDataset:
+    """On which dataset."""
+
+    name: str
+    sha256: str
+    """Over the checksums of its files."""
+    samples: Mapping[str, int]
+    """By split."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leakage:
+    """What of a split stands beside training, of the dataset that the evaluation is on."""
+
+    holdout: str
+    """How test was drawn: by sample, as in the paper, block, run or tag."""
+    within_m: float
+    near_percent: float
+    """Samples whose middle is within that of one of train."""
+    sharing_percent: float | None
+    """Samples whose footprint shares ground with one of train, by the dataset's own audit."""
+
+    def __str__(self) -> str:
+        """Return how near to training a split is, in words."""
+        sharing = "" if self.sharing_percent is None else f"; {self.sharing_percent:.0f} % share ground with one"
+        return (
+            f"Audit (test held out by {self.holdout}): the middles of {self.near_percent:.0f} % of these samples are within "
+            f"{self.within_m:.2f} m of a training sample's{sharing}."
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class SplitErrors:
+    """Tables I and II of one split, and what its labels' deviations, or the simulator, allow."""
+
+    samples: int
+    classes: Mapping[str, int]
+    """Samples by the name of their class."""
+    class_order: tuple[str, ...]
+    errors: ErrorsByClass
+    coverage: Mapping[str, Coverage]
+    """By quantity, of all classes; empty where the model states no intervals."""
+    path_error_percent: Mapping[str, float]
+    """Error of the sums of `PATH_M` m of a run, by quantity (T, E)."""
+    label_floor: ErrorsByClass
+    simulation_floor: ErrorsByClass | None = field(default=None, metadata=ABSENT)
+    """Of what can be predicted at best where the samples were simulated."""
+    leakage: Leakage | None = field(default=None, metadata=ABSENT)
+    """How much of it was met in training; None where nothing trains, or places are not known."""
+
+    @property
+    def floors(self) -> dict[str, ErrorsByClass]:
+        """Return what an error can hardly be less than, by its key."""
+        simulated = {} if self.simulation_floor is None else {"simulation_floor": self.simulation_floor}
+        return {"label_floor": self.label_floor, **simulated}
+
+
+@dataclass(frozen=True, slots=True)
+class AblationRow:
+    """A row of table III: layers that are left, the others being noise, and the errors by split and quantity."""
+
+    layers: tuple[str, ...]
+    errors: Mapping[str, Mapping[str, Errors]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evaluation:
+    """All of evaluation.json."""
+
+    kind: str = KIND
+    schema_version: int = 4
+    tcpipe_version: str
+    key: str
+    """Hash of model, dataset and options: the same key, the same evaluation."""
+    model: EvaluatedModel
+    dataset: EvaluatedDataset
+    config: EvaluateConfig
+    splits: Mapping[str, SplitErrors]
+    ablation: tuple[AblationRow, ...]
+    time: Mapping[str, Mapping[str, Errors]]
+    """Table V: errors of T by predictor and split."""
+    blocks: ErrorsByClass | None = field(default=None, metadata=ABSENT)
+    """Of the model on blocks of ground that it was not fitted on, which it keeps as its held-out samples."""
+    baselines: tuple[BaselineResult, ...] = ()
+    """Of all classes together, by split, baseline and quantity."""
+    repeatability: Mapping[str, Floor | None]
+    """How well each label repeats itself where ground was driven twice; None where none was."""
+    findings: tuple[Finding, ...] = ()
+    verdict: Verdict = field(default_factory=Verdict)
+
+    @property
+    def costs(self) -> tuple[Literal["E", "T"], ...]:
+        """Return which of energy and time were evaluated."""
+        known = {quantity for part in self.splits.values() for quantity in part.errors}
+        both: tuple[Literal["E", "T"], ...] = ("E", "T")
+        return tuple(quantity for quantity in both if quantity in known)
+
+    @property
+    def judged(self) -> tuple[Affected, ...]:
+        """Return what the verdict is about."""
+        return PREDICTED if "E" in self.costs else ("time",)
+
+    @property
+    def ordered_splits(self) -> list[str]:
+        """Return the splits that were evaluated, in the paper's order."""
+        return [split for split in SPLITS if split in self.splits]
+
 
 INPUT_SETS = (("O", "C", "H"), ("C", "H"), ("O", "H"), ("O", "C"), ("O",), ("C",), ("H",))
 """Layers that are left, in the order of table III."""
 
 LETTERS = {"O": "ortho", "C": "terrain", "H": "height"}
 
-EXPECTED = "expected time"
-
+OURS, EXPECTED = "ours", "expected time"
+UNKNOWN_DISTANCE = "Its distance from training is unknown."
 
 PlantCosts = Callable[[Split], dict[str, Array]]
 """Costs of samples by a predictor that knows how they were simulated."""
@@ -91,7 +228,6 @@ Said = Mapping[str, Predicted]
 def evaluate(
     model: str | Path,
     dataset: str | Path,
-    out: Path,
     config: EvaluateConfig,
     *,
     key: str,
@@ -102,14 +238,11 @@ def evaluate(
 
     Beside it stands what was measured and predicted of every sample (`tcpipe.learning.predictions`).
 
-    Networks that it needs beside it are trained into ``out`` and kept there. ``plant`` is the best that can be predicted where the
-    samples were simulated.
+    ``plant`` is the best that can be predicted where the samples were simulated.
     """
     ours = load_model(model, predictor)
     data = open_dataset(dataset, label=ours.card.label_energy)
     check_fit(ours.card, data, str(model))
-    training = ours.card.training
-    fitting, fitted = replace(training.config, model=training.kind), training.samples["fitted"]
     names = {entry.id: entry.name for entry in ours.card.class_table.classes}
     sets = {name: found for name in SPLITS if len((found := collect_measured(data[name], names)).split)}
     if not sets:
@@ -117,22 +250,10 @@ def evaluate(
             f"{data.path}: no labelled samples in test nor unseen: nothing to evaluate on; build it with a --split"
         )
     said = {name: predict_costs(ours, found.split) for name, found in sets.items()}
-    spreads = {name: predict_spreads(ours, said[name], found.class_ids) for name, found in sets.items()}
+    spreads = {name: predict_spreads(ours, said[name], found) for name, found in sets.items()}
     for name, found in sets.items():
         logger.info("%s: %d samples of %s", name, len(found.split), ", ".join(found.names.values()))
 
-    def trained(name: str, variant: Variant) -> Model:
-        place = out / NETWORKS / name
-        few = int((select_train(data, variant).column("fold") != fitting.fold).sum())
-        # as many steps, not as many epochs
-        longer = np.ceil(fitted / fitting.batch_size) / np.ceil(few / fitting.batch_size)
-        rules = replace(fitting, epochs=round(longer * fitting.epochs), patience=round(longer * fitting.patience))
-        train(dataset, place, config=rules, variant=variant, predictor=predictor)
-        return load_model(place, predictor)
-
-    ablation = list(_iterate_ablation(ours, sets, config))
-    with_networks = config.baselines and find_kind(ours.card.training.kind).stops_by_fold
-    energy, networks = make_energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
     baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
     evaluation = Evaluation(
         tcpipe_version=__version__,
@@ -141,15 +262,13 @@ def evaluate(
         dataset=EvaluatedDataset(data.card.name, compute_dataset_checksum(data.card), data.card.splits),
         config=config,
         splits={name: _measure_split(data, part, said[name], spreads[name], plant) for name, part in sets.items()},
-        ablation=tuple(ablation),
-        energy=energy,
-        networks=tuple(networks),
+        ablation=tuple(_iterate_ablation(ours, sets, config)),
         time=_compare_times(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.card.robot, data)),
         baselines=tuple(baselines),
         blocks=compute_block_errors(ours, names),
         repeatability=_estimate_repeatability(data.card, ENERGIES[ours.card.label_energy]),
     )
-    findings = (*lacking, *_find_mismatches(ours, data, sets, energy), *find_weaknesses(evaluation))
+    findings = (*lacking, *_find_mismatches(ours, data, sets), *find_weaknesses(evaluation))
     evaluation = replace(evaluation, findings=findings, verdict=judge(findings))
     return evaluation, make_predictions_table(
         sets, {name: predicted.costs for name, predicted in said.items()}, spreads
@@ -169,7 +288,7 @@ def _measure_split(
     def compute_by_class(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
         return compute_errors_by_class(costs, found.costs, found.class_ids, found.names, spreads)
 
-    runs, uncentred = found.split.column("run_id"), compute_by_class(said.uncentred)
+    runs, start_ns = found.split.column("run_id"), found.split.column("start_ns")
     counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
     return SplitErrors(
         samples=len(found.split),
@@ -182,7 +301,11 @@ def _measure_split(
             )
             for quantity, spread in spreads.items()
         },
-        uncentred={quantity: by_class[ALL] for quantity, by_class in uncentred.items()},
+        path_error_percent={
+            quantity: compute_path_error(said.costs[quantity], found.costs[quantity], runs, start_ns)
+            for quantity in "TE"
+            if quantity in said.costs
+        },
         leakage=measure_leakage(data, found.split),
         label_floor=compute_label_floor(found.own_deviations, found.costs, found.class_ids, found.names),
         simulation_floor=None if plant is None else compute_by_class(plant(found.split)),
@@ -206,7 +329,7 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig) -> Iterat
                 for draw in range(config.noise_draws if noise else 1)
             ]
             by_split[name] = {quantity: average_draws(draw[quantity] for draw in draws) for quantity in draws[0]}
-        yield AblationRow(letters, **by_split)
+        yield AblationRow(letters, by_split)
 
 
 def _list_input_sets(ours: Model) -> list[tuple[str, ...]]:
@@ -218,7 +341,7 @@ def _list_input_sets(ours: Model) -> list[tuple[str, ...]]:
 
 def _compute_errors(said: Predicted, found: Measured, by: Model) -> dict[str, Errors]:
     """Return the errors of all classes, and how well a model told them."""
-    spreads = predict_spreads(by, said, found.class_ids)
+    spreads = predict_spreads(by, said, found)
     by_class = compute_errors_by_class(said.costs, found.costs, found.class_ids, found.names, spreads)
     return {quantity: by_class[quantity][ALL] for quantity in by_class}
 
@@ -244,10 +367,8 @@ def _compare_times(
     return found
 
 
-def _find_mismatches(
-    ours: Model, data: Dataset, sets: Sets, energy: Mapping[str, Mapping[str, Errors]]
-) -> Iterator[Finding]:
-    """Yield where model and dataset do not fit, and the samples that some figures are without."""
+def _find_mismatches(ours: Model, data: Dataset, sets: Sets) -> Iterator[Finding]:
+    """Yield where model and dataset do not fit, and the samples without a label."""
     if compute_dataset_checksum(data.card) != ours.card.dataset.sha256:
         names = {"dataset": ours.card.dataset.name}
         yield make_finding("model-of-another-dataset", Subject("model", ours.name), names=names)
@@ -260,9 +381,6 @@ def _find_mismatches(
                 yield make_finding("class-not-in-training", unseen, names={"split": name}, sample_count=count)
         if unlabelled := total - len(found.split):
             yield make_finding("samples-without-label", subject, unlabelled_count=unlabelled, sample_count=total)
-        if len(energy) > 1 and (without := len(found.split) - energy[OURS][name].count):
-            total = len(found.split)
-            yield make_finding("classes-without-network", subject, left_count=without, sample_count=total)
 
 
 _UNKNOWN = {0: "unknown"}
@@ -306,6 +424,14 @@ def compute_block_errors(model: Model, names: Mapping[int, str]) -> ErrorsByClas
 _QUANTITIES = {"energy": "E", "time": "T"}
 
 
+def find_large_error(error: float, name: str, subject: Subject) -> Iterator[Finding]:
+    """Yield that a sum of ``time`` or ``energy`` is off by a share that needs care, or by one that forbids to use it."""
+    code = f"{name}-far-off"
+    if error >= read_threshold(code, "max_usable_fraction"):
+        severity: Severity = "error" if error >= read_threshold(code, "max_error_fraction") else "warning"
+        yield make_finding(code, subject, severity=severity, error_fraction=error)
+
+
 def find_weaknesses(found: Evaluation) -> Iterator[Finding]:
     """Yield what the errors of each split show, and that there is no unseen split."""
     for split in found.ordered_splits:
@@ -325,11 +451,7 @@ def find_weaknesses(found: Evaluation) -> Iterator[Finding]:
 
 def _find_large_errors(part: SplitErrors, subject: Subject) -> Iterator[Finding]:
     for name, quantity in _QUANTITIES.items():
-        if quantity not in part.errors:
-            continue
-        error = (part.errors[quantity][ALL].mape_percent or 0.0) / 100.0
-        if error >= read_threshold(f"{name}-far-off", "max_error_fraction"):
-            yield make_finding(f"{name}-far-off", subject, error_fraction=error)
+        yield from find_large_error(part.path_error_percent.get(quantity, 0.0) / 100.0, name, subject)
     energy = part.errors.get("E")
     if energy is None:
         return
@@ -343,20 +465,15 @@ def _find_large_errors(part: SplitErrors, subject: Subject) -> Iterator[Finding]
 
 
 def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
-    """Yield that the model does not beat curves over class and slope, and of energy that it does not beat the best baseline."""
-    for name, quantity in _QUANTITIES.items():
-        rank = rank_model(found.baselines, subject.name, quantity)
-        if rank is None:
-            continue
-        if rank.beats_curves is False and found.model.training.kind not in CURVES:
-            yield make_finding(f"{name}-no-better-than-curves", subject)
-        if quantity == "E" and not rank.beats_all:
-            best, ratio = rank.best.baseline, rank.best.rmse_ratio.value or 0.0
-            kind = next(kind for kind, baseline in BASELINE_OF_KIND.items() if baseline == best)
-            is_other = rank.is_worse and kind != found.model.training.kind
-            remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if is_other else []
-            names = {"baseline": best}
-            yield make_finding("baseline-not-beaten", subject, names=names, remedies=remedies, rmse_fraction=ratio)
+    """Yield that the model does not beat the best baseline in energy."""
+    best = find_best(found.baselines, subject.name, "E")
+    if best is None or best.is_beaten:
+        return
+    names, kind = {"baseline": best.baseline}, KIND_OF_BASELINE.get(best.baseline)
+    is_other = best.is_better and kind not in {None, found.model.training.kind}
+    remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if is_other else []
+    ratio = best.rmse_ratio.value or 0.0
+    yield make_finding("baseline-not-beaten", subject, names=names, remedies=remedies, rmse_fraction=ratio)
 
 
 def _find_coverage(part: SplitErrors, subject: Subject) -> Iterator[Finding]:

@@ -1,31 +1,45 @@
 """The page of an evaluation: a verdict, its samples, and its tables beside those of the paper.
 
-The paper's own results (Eder and Steinbauer-Wagner, section V), to stand beside a dataset's: tables I to V.
+The paper's own results (Eder and Steinbauer-Wagner, section V) stand beside a dataset's: tables I to V.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple
+from pathlib import Path
 from typing import Literal
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
 from tcpipe.cost.coverage import Coverage
-from tcpipe.learning.baselines import ALL_LAYERS_PER_CLASS, GRASS_ONLY, OURS, PER_CLASS
-from tcpipe.learning.evaluation import EXPECTED
-from tcpipe.learning.evaluation_facts import SPLITS, Evaluation, Leakage
-from tcpipe.learning.evaluation_figures import (
-    WORST,
-    EvaluatedSamples,
-    draw_calibration,
-    draw_predictions,
-    make_page_data,
-    make_slope_section,
+from tcpipe.dataset.energies import ENERGIES
+from tcpipe.learning.baselines import SPLITS
+from tcpipe.learning.evaluation import EXPECTED, OURS, UNKNOWN_DISTANCE, Evaluation
+from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
+from tcpipe.learning.predictions import (
+    LEVELS,
+    compute_calibration,
+    compute_cost_errors,
+    find_main_cost,
+    find_worst_rows,
+    make_column_name,
 )
-from tcpipe.learning.metrics import ALL, LEAST, UNITS, Errors
 from tcpipe.learning.predictor import find_kind
-from tcpipe.report.page import Number, Section, render_page, show_verdict
-from tcpipe.report.plots import draw_ratios
-from tcpipe.tables.findings import judge_again
+from tcpipe.report.colours import CLASS_COLOURS, FAINT, find_class_colour
+from tcpipe.report.page import (
+    Number,
+    Section,
+    Shaded,
+    render_page,
+    show_verdict,
+)
+from tcpipe.report.plots import Plot, draw_ratios, make_plot, show_text
+from tcpipe.tables.columns import to_floats, to_texts
+from tcpipe.tables.findings import judge_again, read_threshold
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
 """Lower bounds of errors, and their names on the page."""
@@ -39,41 +53,40 @@ _DIGITS = {"w": 2, "v": 3, "T": 3, "E": 2}
 _CALLED = {"test": "test samples of the known area", "unseen": "the unseen area"}
 
 
-def render_evaluation_page(
-    found: Evaluation, samples: EvaluatedSamples, *, title: str, lead: str, warnings: Sequence[str] = ()
-) -> str:
-    """Return the HTML page of what `evaluate` found; ``warnings`` come first."""
-    has_samples = bool(samples.table.num_rows)
-    parts = [*_make_class_sections(found), *_make_other_sections(found)]
+def render_evaluation_page(found: Evaluation, table: pa.Table, *, warnings: Sequence[str] = ()) -> str:
+    """Return the HTML page of what `evaluate` found, with its table of predictions; ``warnings`` come first."""
+    name, of_power = found.dataset.name, found.model.label_energy
+    note = "" if of_power == "total" else f" (w and E {ENERGIES[of_power].words})"
+    costs = "time T and energy E" if "E" in found.costs else "time T"
     paper = Section(
         "Comparison with the paper",
-        "The paper's five tables with the figures of this model.\n" + COUNTED,
-        parts=[part for part in parts if part.rows],
+        "The paper's tables with the figures of this model; 'tcpipe benchmark' and 'reproduce' add its other networks.\n"
+        + COUNTED,
+        parts=[part for part in (*_make_class_sections(found), *_make_other_sections(found)) if part.rows],
     )
-    audits = (f"{split}: {format_leakage(found.splits[split].leakage)}" for split in found.ordered_splits)
+    audits = (f"{split}: {found.splits[split].leakage or UNKNOWN_DISTANCE}" for split in found.ordered_splits)
     sections = [
-        *([draw_predictions(samples, " ".join(audits))] if has_samples else []),
+        draw_predictions(table, " ".join(audits)),
         _make_baselines_section(found),
-        _make_coverage_section(found, samples),
-        *([make_slope_section(samples.table), WORST] if has_samples else []),
+        _make_coverage_section(found, table),
+        make_slope_section(table),
+        make_worst_section(table),
         paper,
     ]
     return render_page(
-        title=title,
-        lead=lead,
+        title=f"Evaluation on {name}",
+        lead=f"Model {Path(found.model.name).name} on dataset {name}: errors of {costs}{note}.",
         numbers=[
             Number(
-                f"{found.splits[name].errors[quantity][ALL].mape_percent or float('nan'):.2f} %",
-                f"MAPE of {quantity}, {name}",
+                f"{found.splits[split].errors[quantity][ALL].mape_percent or float('nan'):.2f} %",
+                f"MAPE of {quantity}, {split}",
             )
-            for name in found.ordered_splits
+            for split in found.ordered_splits
             for quantity in found.costs
         ],
         verdict=show_verdict(judge_again(found.verdict, found.findings), found.findings, labels=found.judged),
         warnings=warnings,
         sections=[section for section in sections if section.rows or section.text],
-        script="evaluation.js" if has_samples else "",
-        data=make_page_data(samples) if has_samples else None,
     )
 
 
@@ -100,7 +113,7 @@ def _make_baselines_section(found: Evaluation) -> Section:
     title, splits = "Comparison with baselines", found.ordered_splits
     if not found.baselines:
         return Section(title)
-    by_cell = {(row.baseline, row.split, row.quantity): row for row in (*found.baselines, *found.networks)}
+    by_cell = {(row.baseline, row.split, row.quantity): row for row in found.baselines}
     names = list(dict.fromkeys(row.baseline for row in found.baselines))
     rows: list[tuple[str, ...]] = []
     for quantity in found.costs:
@@ -132,7 +145,7 @@ def _make_baselines_section(found: Evaluation) -> Section:
     return Section(title, text, plots=plots, parts=[table])
 
 
-def _make_coverage_section(found: Evaluation, samples: EvaluatedSamples) -> Section:
+def _make_coverage_section(found: Evaluation, table: pa.Table) -> Section:
     """Return how well the model knows its errors: calibration, and the share of labels that 90 % intervals cover, with its own interval."""
     rows = [
         (
@@ -143,8 +156,8 @@ def _make_coverage_section(found: Evaluation, samples: EvaluatedSamples) -> Sect
             f"{error.crps:.{_DIGITS[quantity]}f} {UNITS[quantity]}",
         )
         for split in found.ordered_splits
-        for quantity, coverage in found.splits[split].coverage.items()
-        if quantity in "ET"
+        for quantity in found.costs
+        if (coverage := found.splits[split].coverage.get(quantity)) is not None
         and (error := found.splits[split].errors[quantity][ALL]).nll is not None
         and error.crps is not None
     ]
@@ -161,8 +174,7 @@ def _make_coverage_section(found: Evaluation, samples: EvaluatedSamples) -> Sect
         "The 95 % CI of a coverage, where there are enough runs, is binomial, clustered by run."
     )
     header = ("", "", "inside the 90 % interval", "NLL [nat]", "CRPS")
-    plots = draw_calibration(samples.table) if samples.table.num_rows else []
-    return Section("Uncertainty", text, header=header, rows=rows, plots=plots)
+    return Section("Uncertainty", text, header=header, rows=rows, plots=draw_calibration(table))
 
 
 def _format_coverage(coverage: Coverage) -> str:
@@ -210,17 +222,6 @@ def _iterate_class_rows(found: Evaluation, split: str, quantity: str) -> Iterato
             yield ("", "repeatability", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}")
 
 
-def format_leakage(leakage: Leakage | None) -> str:
-    """Return how near to training a split is, in words."""
-    if leakage is None:
-        return "Its distance from training is unknown."
-    sharing = "" if leakage.sharing_percent is None else f"; {leakage.sharing_percent:.0f} % share ground with one"
-    return (
-        f"Audit (test held out by {leakage.holdout}): the middles of {leakage.near_percent:.0f} % of these samples are within "
-        f"{leakage.within_m:.2f} m of a training sample's{sharing}."
-    )
-
-
 _TEXT = {
     "test": "Blocks of train are held out. Label noise alone: the error of a perfect prediction, by what labels of a run do not share.",
     "unseen": "The paper calls it validation; tcpipe uses it neither for tuning nor for early stopping.",
@@ -228,26 +229,17 @@ _TEXT = {
 
 
 def _make_other_sections(found: Evaluation) -> list[Section]:
-    """Return tables III to V: other inputs, other networks, the expected time."""
+    """Return tables III and V: other inputs, the expected time."""
     ablation = {
-        "+".join(row.layers): {split: row.on(split)["E"] for split in found.ordered_splits}
+        "+".join(row.layers): {split: row.errors[split]["E"] for split in found.ordered_splits}
         for row in found.ablation
         if "E" in found.costs
     }
     noise = f"Layers not named are replaced by noise ({found.config.noise_draws} draws)."
-    networks = (
-        "Beside the one network: one of each class with all layers, and Wei and Isler's, which predict E from heights alone.\n"
-        "Each takes as many steps as ours and is centred by class; ratios stand among those of the baselines. "
-    )
-    if not found.networks:
-        networks += "They are trained only if the model is a network."
-    compared = (OURS, ALL_LAYERS_PER_CLASS, PER_CLASS, GRASS_ONLY)
-    others = {name: found.energy[name] for name in compared if name in found.energy}
     times = {EXPECTED: found.time[EXPECTED]} if EXPECTED in found.time else {}
     of_time = "The expected time is d / v at the robot's maximum speed."
     return [
         _make_other_section("Table III: ablation, E", noise, found, "E", ablation),
-        _make_other_section("Table IV: energy, one network or one per class", networks, found, "E", others),
         _make_other_section("Table V: time against the expected time", of_time, found, "T", times),
     ]
 
@@ -296,8 +288,161 @@ PAPER = {
     "C": ((91.93, 47.16), (79.83, 40.07)),
     "H": ((28.67, 13.31), (32.09, 17.36)),
     OURS: ((21.51, 10.77), (26.63, 12.80)),
-    GRASS_ONLY: ((51.39, 27.25), (56.16, 28.37)),
-    PER_CLASS: ((34.52, 14.64), (32.92, 16.96)),
     EXPECTED: ((0.22, 17.45), (0.17, 13.82)),
 }
 """Tables III (layers that are left) to V: RMSE [J or s] and MAPE [%] of E, or of T for the expected time, on test and on unseen."""
+
+
+_CALLED_QUANTITY = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}
+_COLOURS = dict(zip(QUANTITIES, CLASS_COLOURS, strict=False))
+_MOST_DRAWN = 5_000
+"""Samples in a scatter plot: the first ones, in random order."""
+_WORST = 10
+"""Samples of each split in the table of the largest errors."""
+_SLOPE_EDGES_DEG = (-15.0, -10.0, -5.0, -2.0, 2.0, 5.0, 10.0, 15.0)
+"""Between the ranges of slope along travel [deg]; the paper's robot climbs 22.5°."""
+_SLOPE_NAMES = (
+    *("below -15°", "-15° to -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°"),
+    *("2° to 5°", "5° to 10°", "10° to 15°", "above 15°"),
+)
+_WHOLE_JOULE = 10.0
+"""Error of E from which whole joules suffice, so that nine ranges of slope fit."""
+
+
+def draw_predictions(table: pa.Table, audit: str) -> Section:
+    """Return a point for each sample, E and T; ``audit`` says how far they are from training."""
+    text = "Each point is a segment, coloured by class; on the line the prediction is exact. Point at one for its name and errors."
+    drawn = table.slice(0, _MOST_DRAWN)
+    if drawn.num_rows < table.num_rows:
+        text += f" {drawn.num_rows} of {table.num_rows} are drawn, at random."
+    class_id, names = drawn.column("terrain_class").to_numpy(), to_texts(drawn.column("terrain_name"))
+    legend = {str(name): find_class_colour(int(number)) for number, name in zip(class_id, names, strict=True)}
+    plots = list[Plot]()
+    for quantity in ("E", "T"):
+        label, said = (to_floats(drawn, make_column_name(quantity, part)) for part in ("", "predicted"))
+        known = np.isfinite(label + said)
+        if not known.any():
+            continue
+        plot = make_plot(
+            f"against {quantity}",
+            alt=f"Predicted over measured {_CALLED_QUANTITY[quantity]}, a point a sample; the tables below list the figures by class.",
+            axes=(f"{_CALLED_QUANTITY[quantity]}, measured [{UNITS[quantity]}]", f"predicted [{UNITS[quantity]}]"),
+            legend={} if plots else legend,
+            height_px=380,
+        )
+        source = {
+            "x": label[known], "y": said[known], "colour": [legend[str(name)] for name in names[known]],
+            "text": _describe_rows(drawn.filter(pa.array(known)), quantity),
+        }  # fmt: skip
+        show_text(plot, plot.figure.scatter("x", "y", size=5, color="colour", alpha=0.6, source=source))
+        ends = [float(label[known].min()), float(label[known].max())]
+        plot.figure.line(ends, ends, color=FAINT, line_width=2, line_dash="dashed")
+        plots.append(plot)
+    return Section("Measured against predicted", f"{text}\n{audit}", plots=plots)
+
+
+def _describe_rows(table: pa.Table, quantity: str) -> list[str]:
+    """Return one line a sample: its name, ground, and what was measured and predicted."""
+    label, said = (to_floats(table, make_column_name(quantity, part)) for part in ("", "predicted"))
+    ids, names, slope = (
+        to_texts(table.column("sample_id")),
+        to_texts(table.column("terrain_name")),
+        _read_slope_deg(table),
+    )
+    digits = 0 if quantity == "E" else 2
+    return [
+        f"{sample}: {name}, {degrees:.1f}°, measured {true:.{digits}f}, predicted {found:.{digits}f} {UNITS[quantity]}"
+        for sample, name, degrees, true, found in zip(ids, names, slope, label, said, strict=True)
+    ]
+
+
+def _read_slope_deg(table: pa.Table) -> NDArray[np.float64]:
+    return np.degrees(to_floats(table, "slope_rad"))
+
+
+def make_worst_section(table: pa.Table) -> Section:
+    """Return the samples of each split with the largest errors of E, or of T without energy, largest first."""
+    worst, quantity = table.take(pa.array(find_worst_rows(table, _WORST))), find_main_cost(table)
+    off, slope = compute_cost_errors(worst, quantity), _read_slope_deg(worst)
+    label, std = (to_floats(worst, make_column_name(quantity, part)) for part in ("", "std"))
+    texts = [to_texts(worst.column(name)) for name in ("split", "sample_id", "terrain_name")]
+    rows = [
+        (split, sample, name, f"{degrees:.1f}°", f"{true:.1f} ± {own:.1f}", f"{error:+.1f}")
+        for split, sample, name, degrees, true, own, error in zip(*texts, slope, label, std, off, strict=True)
+    ]
+    header = ("", "sample", "class", "slope", f"{quantity} [{UNITS[quantity]}]", "predicted less measured")
+    text = (
+        "Look for a common cause: a wrong class in the map, a step missing in the heights, a label with a large σ.\n"
+        "'tcpipe explain SAMPLE' says where a sample came from."
+    )
+    return Section("Worst segments", text, header=header, rows=rows, folded=True)
+
+
+def make_slope_section(table: pa.Table) -> Section:
+    """Return the RMSE of E, or of T without energy, by split, class and range of slope, as a heat map."""
+    part, quantity = table.filter(pc.is_valid(table.column("slope_rad"))), find_main_cost(table)
+    off = compute_cost_errors(part, quantity)
+    ranges = np.searchsorted(np.radians(_SLOPE_EDGES_DEG), to_floats(part, "slope_rad"), side="right")
+    label, low, high = (
+        to_floats(part, make_column_name(quantity, kind)) for kind in ("", "predicted_low", "predicted_high")
+    )
+    is_outside = (label < low) | (label > high)
+    splits, classes = (to_texts(part.column(name)) for name in ("split", "terrain_name"))
+    lines = list(dict.fromkeys(zip(splits.tolist(), classes.tolist(), strict=True)))
+    columns = np.unique(ranges).tolist()
+    cells = {
+        (*line, at): (splits == line[0]) & (classes == line[1]) & (ranges == at) for line in lines for at in columns
+    }
+    errors = {cell: off[rows & np.isfinite(off)] for cell, rows in cells.items()}
+    rmse = {cell: float(np.sqrt(np.mean(part**2))) for cell, part in errors.items() if len(part)}
+    most = max(rmse.values(), default=1.0) or 1.0
+    digits = 0 if most >= _WHOLE_JOULE else 2
+    enough, least = (
+        read_threshold("energy-overconfident", f"min_cell_{name}") for name in ("count", "coverage_fraction")
+    )
+
+    def shade(cell: tuple[str, str, int]) -> str | Shaded:
+        if cell not in rmse:
+            return ""
+        count = len(errors[cell])
+        is_doubtful = count >= enough and bool(is_outside[cells[cell]].mean() > 1.0 - least)
+        text = f"{rmse[cell]:.{digits}f} ({count}){'*' if is_doubtful else ''}"
+        return Shaded(text, rmse[cell] / most, alarm=is_doubtful)
+
+    text = (
+        f"RMSE of {quantity} [{UNITS[quantity]}], in brackets the number of segments; darker is worse. * and a dashed border: "
+        f"90 % intervals cover fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them."
+    )
+    header = ["split", "class", *(_SLOPE_NAMES[at].replace(" to ", "…") for at in columns)]
+    rows = [[*line, *(shade((*line, at)) for at in columns)] for line in sorted(lines)]
+    return Section("Error by class and slope", text, header=header, rows=rows)
+
+
+def draw_calibration(table: pa.Table) -> list[Plot]:
+    """Return for each split the share of labels below each quantile that the model states."""
+    plots: list[Plot] = []
+    for split in pc.unique(table.column("split")).to_pylist():
+        part = table.filter(pc.equal(table.column("split"), split))
+        found = {q: shares for q in QUANTITIES if (shares := compute_calibration(part, q)) is not None}
+        if not found:
+            continue
+        plot = make_plot(
+            f"calibration {split}",
+            alt=f"Share of labels of {split} below each quantile that the model states; on the diagonal the model is calibrated.",
+            axes=("share stated", f"share of {split} labels below"),
+            legend={} if plots else {_CALLED_QUANTITY[q]: _COLOURS[q] for q in found},
+            height_px=320,
+            tools="save,hover",
+            waits=True,
+        )
+        plot.figure.hover.tooltips = [("", "$name"), ("stated", "@stated{0 %}"), ("found", "@found{0.0 %}")]
+        plot.figure.line([0, 1], [0, 1], color=FAINT, line_dash="dashed", line_width=2, name="known")
+        lines = [
+            plot.figure.line(
+                "stated", "found", source={"stated": LEVELS, "found": shares}, color=_COLOURS[q], line_width=2, name=_CALLED_QUANTITY[q]
+            )
+            for q, shares in found.items()
+        ]  # fmt: skip
+        plot.figure.hover.renderers = lines
+        plots.append(plot)
+    return plots

@@ -23,7 +23,7 @@ from tcpipe.tables.bounds import Bounds
 
 Floats = NDArray[np.float32]
 
-ModelKind = Literal["mean", "linear", "spline", "physics", "boosting", "resnet18", "own"]
+ModelKind = Literal["linear", "physics", "boosting", "resnet18", "own"]
 """Curves of class and slope, physics, a curve and boosted trees, the paper's network, or own code."""
 
 Loss = Literal["nrmse", "paper_eq4"]

@@ -102,12 +102,13 @@ _SCORES = tuple(entry.name for entry in fields(Errors))[4:]
 def average_draws(draws: Iterable[Errors]) -> Errors:
     """Return the mean errors of the same samples under several draws of noise."""
     found = list(draws)
-    rmse, mape = _mean(draw.rmse for draw in found), _mean(draw.mape_percent for draw in found)
-    scores = (_mean(getattr(draw, name) for draw in found) for name in _SCORES)
+    rmse, mape = mean_known(draw.rmse for draw in found), mean_known(draw.mape_percent for draw in found)
+    scores = (mean_known(getattr(draw, name) for draw in found) for name in _SCORES)
     return Errors(found[0].count, rmse, mape, found[0].mape_count, *scores)
 
 
-def _mean(values: Iterable[float | None]) -> float | None:
+def mean_known(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are known; None of none."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 
@@ -160,6 +161,26 @@ def compute_label_floor(
         return Errors(len(std), float(np.sqrt(np.mean(std**2))) if len(std) else None, mape, int(large.sum()))
 
     return {quantity: _group_by_class(partial(compute_rows, quantity), class_ids, names) for quantity in deviations}
+
+
+PATH_M = 30
+"""Length of the paths by whose sums a model is judged, in samples of about a metre."""
+
+
+def compute_path_error(
+    predicted: Array, measured: Array, runs: NDArray[np.generic], start_ns: NDArray[np.generic]
+) -> float:
+    """Return the error of sums over consecutive paths of `PATH_M` samples of a run [%]: root mean square, over the mean sum.
+
+    All arrays have shape (N,); the rest of a run counts as a path if it is its only one.
+    """
+    order, sums = np.lexsort((start_ns, runs)), list[tuple[float, float]]()
+    for rows in np.split(order, np.flatnonzero(runs[order][1:] != runs[order][:-1]) + 1):
+        for path in np.array_split(rows, max(len(rows) // PATH_M, 1)):
+            sums.append((float(predicted[path].sum()), float(measured[path].sum())))
+    said, true = np.array(sums).T
+    size = float(np.abs(true).mean())
+    return 100.0 * float(np.sqrt(np.mean((said - true) ** 2))) / size if size else 0.0
 
 
 def compute_costs(power_watt: Array, velocity_mps: Array, chord_m: float) -> dict[str, Array]:

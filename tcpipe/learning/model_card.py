@@ -25,7 +25,7 @@ from tcpipe.terrain.layers import PAPER_LAYERS, ClassTable, TerrainClass, make_p
 
 KIND = "tcpipe model"
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """Version of model.json and the files next to it."""
 
 

@@ -23,12 +23,12 @@ class TrainOptions:
     out: str | Path = option("model", Option(kind="published", metavar="[OUT]", is_argument=True))
     """The same dataset and options are not trained again."""
     _: KW_ONLY
-    model: Literal["auto", "mean", "linear", "spline", "physics", "boosting", "resnet18"] | None = option(
+    model: Literal["auto", "linear", "physics", "boosting", "resnet18"] | None = option(
         None,
         Option(
             "Curves of class and slope, physics, a curve and boosted trees on what it leaves, or the paper's network. "
             "auto: the simplest that predicts other runs as well as the best (default; with an option of the network, resnet18).",
-            kind=("auto", "mean", "linear", "spline", "physics", "boosting", "resnet18"),
+            kind=("auto", "linear", "physics", "boosting", "resnet18"),
         ),
     )  # fmt: skip
     predictor: str | None = option(None, PREDICTOR)
@@ -96,19 +96,12 @@ class EvaluateOptions:
     noise_draws: int = option(
         5, Option("Draws of noise for each ablated input set.", ("--noise-draws",), Range(1, 1000))
     )
-    baselines: bool = option(
-        True,
-        Option(
-            "Train networks beside the model: one per class with all layers; Wei and Isler's, height-only, for grass and per class.",
-            ("--baselines/--no-baselines",),
-        ),
-    )
     seed: int = option(0, Option("Seed of the noise.", kind=SEED))
     predictor: str | None = option(None, PREDICTOR)
     adapt: Sequence[float] | None = option(
         None,
         Option(
-            "Adapt MODEL to each run of DATASET (or --drive), whose robot may be another, by so many first metres; evaluate the rest.",
+            "With --drive: adapt MODEL to each drive, whose robot may be another, by so many first metres; evaluate the rest.",
             kind="lengths", metavar="0,10,50",
         ),
     )  # fmt: skip

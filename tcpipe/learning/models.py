@@ -5,6 +5,7 @@
     model.json         what it takes, gives, and has seen; how it was trained; checksums of the rest
     weights.npz        every weight by its path in the network; a table's curves and trees; coefficients of physics
     residuals.parquet  labels and predictions of the fold that stopped a network; else of all samples, by the other folds
+    ground.parquet     longitude and latitude of the training samples; empty without coordinates
     history.csv        losses of every epoch
     MODEL.md           the same for people
 """
@@ -36,19 +37,23 @@ from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
 from tcpipe.learning.own_models import OwnKind, load_own_kind, report_errors
 from tcpipe.learning.predictor import Prediction, Predictor, ask_predictor, find_kind
+from tcpipe.splits.audit import CLOSE, are_near
 
 logger = logging.getLogger("tcpipe")
 
 Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
 
-FILES = CARD, WEIGHTS, RESIDUALS, HISTORY, README = (
+FILES = CARD, WEIGHTS, RESIDUALS, GROUND, HISTORY, README = (
     "model.json",
     "weights.npz",
     "residuals.parquet",
+    "ground.parquet",
     "history.csv",
     "MODEL.md",
 )
+
+GROUND_COLUMNS = "lon_deg", "lat_deg"
 
 _SPEED_MARGIN_MPS = 0.01
 """By which a speed that is asked for may lie beside those of training: it is rounded."""
@@ -67,6 +72,8 @@ class Model:
     """Of the held-out fold, one row a sample: run_id, start_ns, terrain_class, labels, predictions."""
     own: OwnKind | None = None
     """The user's code."""
+    ground_deg: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
+    """Longitude and latitude of the training samples, shape (N, 2)."""
 
     @cached_property
     def predictor(self) -> Predictor:
@@ -90,6 +97,10 @@ class Model:
     def errors(self) -> dict[str, Errors] | None:
         """What held-out samples show of its errors; None of too few."""
         return fit_errors(self.residuals)
+
+    def find_near(self, lonlat_deg: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which points, shape (N, 2), are near ground of training samples."""
+        return are_near(lonlat_deg, self.ground_deg, within_m=CLOSE * self.card.chord_m, in_degrees=True)
 
     @cached_property
     def _correlation(self) -> float:
@@ -137,12 +148,13 @@ class Model:
 
 
 def write_model(
-    place: Path, *, card: ModelCard, weights: Arrays, residuals: pa.Table, history: str, readme: str
+    place: Path, *, card: ModelCard, weights: Arrays, residuals: pa.Table, ground: pa.Table, history: str, readme: str
 ) -> None:
     """Write the folder, whole or not at all."""
     with write_atomic_directory(place) as directory:
         write_arrays(directory / WEIGHTS, weights)
         write_table(residuals, directory / RESIDUALS)
+        write_table(ground, directory / GROUND)
         write_text(directory / HISTORY, history)
         write_text(directory / README, readme)
         write_sealed(directory / CARD, replace(card, checksums=compute_checksums(directory)))
@@ -169,7 +181,9 @@ def load_model(path: str | Path, predictor: str | None = None) -> Model:
     residuals = {name: table.column(name).to_numpy() for name in table.column_names}
     if "terrain_class" in residuals:  # of a map without classes: null
         residuals["terrain_class"] = np.nan_to_num(residuals["terrain_class"].astype(np.float64)).astype(np.uint8)
-    model = Model(str(path), card, place, compute_card_checksum(card), residuals)
+    ground = read_table(place / GROUND)
+    ground_deg = np.column_stack([ground.column(name).to_numpy() for name in GROUND_COLUMNS])
+    model = Model(str(path), card, place, compute_card_checksum(card), residuals, ground_deg=ground_deg)
     needs_code = find_kind(card.training.kind) is Predictor
     return _add_code(model, predictor) if needs_code or predictor is not None else model
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,6 @@ from torch import nn
 from torch.nn import functional
 
 from tcpipe.errors import ModelError
-from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.weights import check_arrays
 from tcpipe.learning.fitting import mean_loss
 
@@ -173,6 +173,9 @@ def _reorder_axes(value: Any) -> Any:
     return value.permute(2, 3, 1, 0) if value.ndim == 4 else value.T if value.ndim == 2 else value
 
 
+_DIGEST_BYTES = 32
+"""Size of the SHA-256 before a packed state [byte]."""
+
 _EPSILON = 1e-7
 """Epsilon of Adam, as Keras has it; torch's own is 1e-8."""
 
@@ -185,17 +188,19 @@ class Trainer:
         self._factors = torch.from_numpy(factors).to(find_device())
         self.optimizer = torch.optim.Adam(network.parameters(), eps=_EPSILON)
 
-    def write_state(self, path: Path, parts: Mapping[str, Any]) -> None:
-        """Write weights, the optimiser's memory and other parts of a training, whole or not at all."""
+    def pack_state(self, parts: Mapping[str, Any]) -> bytes:
+        """Return weights, the optimiser's memory and other parts of a training as bytes."""
         state = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(), **parts}
-        torch.save(state, memory := io.BytesIO())  # of a full disk it would say where it stands in the file
-        with write_atomic_file(path) as temporary:
-            temporary.write_bytes(memory.getbuffer())
+        torch.save(state, memory := io.BytesIO())
+        packed = memory.getvalue()
+        return sha256(packed).digest() + packed
 
     def read_state(self, path: Path) -> dict[str, Any]:
-        """Go on from what `write_state` wrote, and return the other parts; `ModelError` where it is damaged."""
+        """Continue from a file of `pack_state`, and return the other parts; `ModelError` where it is damaged."""
         try:
-            state: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
+            data = path.read_bytes()
+            packed = data[_DIGEST_BYTES:] if sha256(data[_DIGEST_BYTES:]).digest() == data[:_DIGEST_BYTES] else b""
+            state: dict[str, Any] = torch.load(io.BytesIO(packed), weights_only=True, map_location="cpu")
             self.network.load_state_dict(state.pop("network"))
             self.optimizer.load_state_dict(state.pop("optimizer"))
         except Exception as error:  # noqa: BLE001  those of torch, pickle and zipfile have no common base

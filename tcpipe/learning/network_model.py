@@ -21,6 +21,7 @@ from tcpipe.dataset.extra_features import (
     standardize_features,
 )
 from tcpipe.errors import ModelError
+from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.learning.fitting import FitConfig, TrainingTimes, compute_loss_factors
 from tcpipe.learning.predictor import (
     Fitted,
@@ -48,8 +49,8 @@ gradient of a 1 × 1 convolution with a stride (its issue 6035); seen to crash w
 _SLOWER = 0.1
 """Factor of the learning rate when the loss stops falling."""
 
-_STEPS_BETWEEN = 32
-"""Steps that a stop loses at most, unless an epoch has more: a state has 180 MB."""
+_SECONDS_BETWEEN = 60.0
+"""Training that a crash loses at most, beyond an epoch [s]; an interruption loses only the epoch in which it occurs."""
 
 _LAST = 0.8
 """Share of the maximum of epochs after which the rate is smaller in any case."""
@@ -92,12 +93,25 @@ class _State:
     held_out: NDArray[np.float64]
     """Predictions of samples that were held out, shape (N, outputs); NaN where there is none yet."""
 
-    def write(self, path: Path) -> None:
+    packed: bytes = b""
+    """The state at the end of the last epoch."""
+    written_s: float = float("-inf")
+
+    def keep(self, path: Path) -> None:
+        """Pack the state; write it if the last one was written long ago."""
         parts = {"progress": asdict(self.progress), "best": self.best, "held_out": self.held_out.tolist()}
-        self.trainer.write_state(path, parts)
+        self.packed = self.trainer.pack_state(parts)
+        if time.monotonic() - self.written_s > _SECONDS_BETWEEN:
+            self.write(path)
+
+    def write(self, path: Path) -> None:
+        """Write the packed state, whole or not at all."""
+        with write_atomic_file(path) as temporary:
+            temporary.write_bytes(self.packed)
+        self.written_s = time.monotonic()
 
     def read(self, path: Path) -> None:
-        """Go on from what `write` wrote; `ModelError` where it is damaged."""
+        """Continue from a file of `write`; `ModelError` where it is damaged."""
         parts = self.trainer.read_state(path)
         self.progress, self.best = TrainingProgress(**parts["progress"]), parts["best"]
         self.held_out = np.array(parts["held_out"])
@@ -139,7 +153,8 @@ class NetworkModel(Predictor):
     def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
         """Train until the loss of the held-out fold stops falling, and return the network with the smallest.
 
-        ``job.checkpoint``, from which training continues, is written before the first epoch and then at least every `_STEPS_BETWEEN` steps.
+        ``job.checkpoint``, from which training continues, is the state at the end of an epoch. It is written before the first epoch, when
+        training is interrupted, and every `_SECONDS_BETWEEN`.
         """
         config, is_held = samples.config, samples.folds == samples.config.fold
         fit, held = samples.take(~is_held), samples.take(is_held)
@@ -150,47 +165,84 @@ class NetworkModel(Predictor):
         if job.checkpoint.exists():
             state.read(job.checkpoint)
             logger.info("%s: resumes after epoch %d", job.name, state.progress.epoch)
-        else:  # a place that cannot be written is found now, not after an epoch
-            state.write(job.checkpoint)
-        progress = state.progress
+        state.keep(job.checkpoint)  # a place that cannot be written is found now, not after an epoch
+        try:
+            cls._fit_until_best(model, state, fit, held, job, times)
+            trainer.network.load_state_dict(state.best)
+            state.held_out[is_held] = predict_samples(model, held).mean
+            for fold in np.unique(samples.folds) if config.cross_fit else ():
+                rows = samples.folds == fold
+                if np.isnan(state.held_out[rows]).any():
+                    logger.info("%s: a network without fold %d, for intervals", job.name, fold)
+                    other = cls._fit_best_epochs(samples.take(~rows), state.progress, times)
+                    state.held_out[rows] = predict_samples(other, samples.take(rows)).mean
+                    state.keep(job.checkpoint)
+            state.keep(job.checkpoint)
+            state.write(job.checkpoint)  # what uses the network may fail
+        except BaseException as error:
+            if not isinstance(error, Exception):  # the user, or a signal
+                state.write(job.checkpoint)
+            raise
+        progress, held_out = state.progress, Prediction.without_covariance(state.held_out)
+        return Fitted(model, held_out, progress.epoch, progress.best_epoch, progress.history, times, device)
+
+    @classmethod
+    def _fit_until_best(  # noqa: PLR0917
+        cls, model: NetworkModel, state: _State, fit: Samples, held: Samples, job: Job, times: TrainingTimes
+    ) -> None:
+        """Train until the loss of ``held`` stops falling."""
+        config, progress = fit.config, state.progress
         while progress.epoch < config.epochs and progress.epoch - progress.best_epoch < config.patience:
-            loss = _train_epoch(trainer, fit, progress, times)
+            loss = cls._train_epoch(state.trainer, fit, progress, times)
             held_loss = compute_held_loss(held, predict_samples(model, held).mean)
             progress.epoch += 1
             progress.history.append((progress.epoch, loss, held_loss))
             if held_loss < progress.best_loss:
                 progress.best_loss, progress.best_epoch = held_loss, progress.epoch
-                state.best = trainer.copy_weights()
-            if progress.epoch % max(_STEPS_BETWEEN * config.batch_size // len(fit), 1) == 0:
-                state.write(job.checkpoint)
+                state.best = state.trainer.copy_weights()
+            state.keep(job.checkpoint)
             _log_epoch(job.name, progress, config, times)
-        trainer.network.load_state_dict(state.best)
-        held_out = state.held_out
-        held_out[is_held] = predict_samples(model, held).mean
-        for fold in np.unique(samples.folds) if config.cross_fit else ():
-            rows = samples.folds == fold
-            if np.isnan(held_out[rows]).any():
-                logger.info("%s: a network without fold %d, for intervals", job.name, fold)
-                other = cls._fit_best_epochs(samples.take(~rows), progress, times)
-                held_out[rows] = predict_samples(other, samples.take(rows)).mean
-                state.write(job.checkpoint)
-        return Fitted(
-            model,
-            Prediction.without_covariance(held_out),
-            progress.epoch,
-            progress.best_epoch,
-            progress.history,
-            times,
-            device,
-        )
 
     @classmethod
     def _fit_best_epochs(cls, fit: Samples, like: TrainingProgress, times: TrainingTimes) -> NetworkModel:
         """Return a network of other samples after as many epochs as were best, at the same rates."""
         trainer, _ = _make_trainer(fit)
         for epoch in range(like.best_epoch):
-            _train_epoch(trainer, fit, TrainingProgress(epoch=epoch, history=like.history[:epoch]), times)
+            cls._train_epoch(trainer, fit, TrainingProgress(epoch=epoch, history=like.history[:epoch]), times)
         return cls(trainer.network, fit.inputs)
+
+    @staticmethod
+    def iterate_batches(fit: Samples, epoch: int) -> Iterator[tuple[Floats, Floats, Floats]]:
+        """Yield patches (N, px, px, depth), labels and weights (N, outputs) of every sample once."""
+        config, inputs = fit.config, fit.inputs
+        rules: dict[str, Any] = {"features": COLUMNS} if inputs.extra_features else {}
+        batches = fit.split.batches(
+            config.batch_size, shuffle=True, seed=config.seed, mirror=config.mirror, weights=config.inverse_variance_weights, **rules
+        )  # fmt: skip
+        feed: Iterator[Any] = batches.epoch(epoch)
+        for patches, labels, *weights in feed:
+            planes = append_column_planes(inputs.extra_features, *patches) if inputs.extra_features else patches
+            yield planes, labels, weights[0] if weights else np.ones_like(labels)
+
+    @classmethod
+    def _train_epoch(cls, trainer: Trainer, fit: Samples, progress: TrainingProgress, times: TrainingTimes) -> float:
+        """Train on every sample once; return the mean loss."""
+        scale, rate = np.array(fit.inputs.scale, np.float32), compute_learning_rate(fit.config, progress)
+        total, count, began = 0.0, 0, time.perf_counter()
+        feed, asked = cls.iterate_batches(fit, progress.epoch), began
+        while (batch := next(feed, None)) is not None:
+            patches, labels, weights = batch
+            times.feeding_s += time.perf_counter() - asked
+            total += trainer.step(patches, labels / scale, weights, rate) * len(patches)
+            count += len(patches)
+            asked = time.perf_counter()
+        times.total_s += time.perf_counter() - began
+        times.samples += count
+        if not np.isfinite(total):
+            raise ModelError(
+                f"training diverged in epoch {progress.epoch + 1} (the loss is {total}); try a smaller --learning-rate"
+            )
+        return total / max(count, 1)
 
 
 def _make_trainer(fit: Samples) -> tuple[Trainer, str]:
@@ -218,36 +270,6 @@ def compute_learning_rate(config: FitConfig, progress: TrainingProgress) -> floa
         if waited >= max(config.patience // 2, 1):
             rate, waited = rate * _SLOWER, 0
     return rate * (_SLOWER if progress.epoch >= _LAST * config.epochs else 1.0)
-
-
-def _train_epoch(trainer: Trainer, fit: Samples, progress: TrainingProgress, times: TrainingTimes) -> float:
-    """Train on every sample once; return the mean loss."""
-    inputs, config, scale = fit.inputs, fit.config, np.array(fit.inputs.scale, np.float32)
-    energy = inputs.outputs == (fit.split.energy.energy,)
-    rules: dict[str, Any] = {"features": inputs.outputs} if energy else {"weights": config.inverse_variance_weights}
-    if inputs.extra_features:
-        rules["features"] = COLUMNS
-    batches = fit.split.batches(config.batch_size, shuffle=True, seed=config.seed, mirror=config.mirror, **rules)
-    rate = compute_learning_rate(config, progress)
-    total, count, began = 0.0, 0, time.perf_counter()
-    feed: Iterator[Any] = batches.epoch(progress.epoch)
-    asked = began
-    while (batch := next(feed, None)) is not None:
-        patches, labels = batch[0] if energy else batch[:2]
-        if inputs.extra_features:
-            patches = append_column_planes(inputs.extra_features, *patches)
-        weights = batch[2] if len(batch) == 3 else np.ones_like(labels)
-        times.feeding_s += time.perf_counter() - asked
-        total += trainer.step(patches, labels / scale, weights, rate) * len(patches)
-        count += len(patches)
-        asked = time.perf_counter()
-    times.total_s += time.perf_counter() - began
-    times.samples += count
-    if not np.isfinite(total):
-        raise ModelError(
-            f"training diverged in epoch {progress.epoch + 1} (the loss is {total}); try a smaller --learning-rate"
-        )
-    return total / max(count, 1)
 
 
 def _log_epoch(name: str, progress: TrainingProgress, config: FitConfig, times: TrainingTimes) -> None:

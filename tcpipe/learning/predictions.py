@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from tcpipe.cost.adaptation import Metres, Run
 from tcpipe.cost.prediction_errors import COVERAGE, Residuals, fit_bias_correction, propagate_stated
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import read_extra_features
@@ -20,7 +19,8 @@ from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, QUANTITIES, UNITS, Array
 from tcpipe.learning.model_card import ModelCard
 from tcpipe.learning.models import Model
 from tcpipe.learning.predictor import Prediction
-from tcpipe.learning.training import compute_dataset_checksum, read_class_table
+from tcpipe.learning.training import read_class_table
+from tcpipe.splits.audit import PLACES, compute_middles
 from tcpipe.tables.columns import Column, to_floats, to_texts
 from tcpipe.terrain.layers import ClassTable
 
@@ -42,14 +42,6 @@ class Measured:
     class_ids: NDArray[np.int64]
     names: Mapping[int, str]
     """Of the classes that occur, by id."""
-
-    def take(self, rows: NDArray[np.int64]) -> Measured:
-        """Return some of the samples."""
-        costs, deviations, own_deviations = (
-            {name: values[rows] for name, values in quantities.items()}
-            for quantities in (self.costs, self.deviations, self.own_deviations)
-        )
-        return Measured(self.split.take(rows), costs, deviations, own_deviations, self.class_ids[rows], self.names)
 
 
 def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
@@ -78,43 +70,27 @@ def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """Costs of a split's samples by one predictor, quantity to values of shape (N,)."""
+    """Costs of a split's samples by one predictor, centred by class: quantity to values of shape (N,)."""
 
     costs: Mapping[str, Array]
-    """Centred by class: what every figure is of unless it says otherwise."""
-    uncentred: Mapping[str, Array]
     stated: Mapping[str, Array]
     """Standard deviations by the predictor; 0 where it states none."""
 
     @classmethod
     def centre(cls, residuals: Residuals, said: Prediction, class_ids: NDArray[np.int64], chord_m: float) -> Predicted:
-        """Return costs of predictions by the predictor's own held-out samples; of energy alone, as of a power at 1 m/s."""
-        is_energy = said.mean.shape[1] == 1
-        power, velocity = said.mean[:, 0], np.ones(len(said.mean))
+        """Return costs of predictions of power and velocity, by the predictor's own held-out samples."""
         is_time = "velocity_mps" in residuals and "power_watt" not in residuals
-        names = ("E",) if is_energy else ("v", "T") if is_time else QUANTITIES
-        if is_energy:
-            residuals, chord_m = _convert_energy_residuals(residuals), 1.0
-        else:
-            velocity = np.maximum(said.mean[:, 1], LEAST_VELOCITY_MPS)
-        centred = fit_bias_correction(residuals).apply(power, velocity, class_ids)
-        costs, uncentred = (
-            compute_costs(w, np.maximum(v, LEAST_VELOCITY_MPS), chord_m) for w, v in (centred, (power, velocity))
-        )
-        stated = {"E": np.zeros(len(power))}
-        if not is_energy:
-            of_metre = propagate_stated(np.column_stack([power, velocity]), said.covariance)
-            stated = {name: of_metre[CALLED[name]] * (chord_m if name in "TE" else 1.0) for name in names}
-        return cls(*({name: values[name] for name in names} for values in (costs, uncentred, stated)))
-
-    def take(self, rows: NDArray[np.int64]) -> Predicted:
-        """Return some of the samples."""
-        parts = (getattr(self, entry.name) for entry in fields(self))
-        return Predicted(*({name: values[rows] for name, values in part.items()} for part in parts))
+        names = ("v", "T") if is_time else QUANTITIES
+        power, velocity = said.mean[:, 0], np.maximum(said.mean[:, 1], LEAST_VELOCITY_MPS)
+        centred_power, centred_velocity = fit_bias_correction(residuals).apply(power, velocity, class_ids)
+        costs = compute_costs(centred_power, np.maximum(centred_velocity, LEAST_VELOCITY_MPS), chord_m)
+        of_metre = propagate_stated(np.column_stack([power, velocity]), said.covariance)
+        stated = {name: of_metre[CALLED[name]] * (chord_m if name in "TE" else 1.0) for name in names}
+        return cls({name: costs[name] for name in names}, stated)
 
 
 def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)) -> Predicted:
-    """Return the predicted w, v, T, E of every sample; v and T of a model of time alone, E of a model of energy alone.
+    """Return the predicted w, v, T, E of every sample; v and T of a model of time alone.
 
     It is centred by class, or as one where it is not shown the classes. Channels that ``noise`` names are replaced by noise of this seed,
     uniform in [0, 1], each pixel on its own (section V-C).
@@ -122,8 +98,7 @@ def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed
     rng, layout = np.random.default_rng(list(seed)), model.card.layout
     replaced = [place for place, plane in enumerate(layout.planes) if plane.partition("[")[0] in noise]
     chosen, features = split.with_layout(layout), read_extra_features(split)
-    width = 2 if model.card.inputs.is_time_alone else len(model.card.inputs.outputs)
-    parts = [Prediction.without_covariance(np.empty((0, width)))]
+    parts = [Prediction.without_covariance(np.empty((0, 2)))]
     for first in range(0, len(chosen), layout.batch_rows):
         rows = np.arange(first, min(first + layout.batch_rows, len(chosen)))
         patches = chosen.batch(rows)[0].copy()
@@ -135,43 +110,24 @@ def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed
     return Predicted.centre(model.residuals, Prediction.concatenate(parts), class_ids, model.card.chord_m)
 
 
-def _convert_energy_residuals(residuals: Residuals) -> Residuals:
-    """Return the residuals of a model of energy as those of a power at 1 m/s."""
-    if "energy_predicted_joule" not in residuals:
-        return {}
-    label, said = residuals["energy_joule"], residuals["energy_predicted_joule"]
-    ones = np.ones(len(label))
-    known = {"power_watt": label, "power_predicted_watt": said, "velocity_mps": ones, "velocity_predicted_mps": ones}
-    return {**residuals, **known}
-
-
-def predict_spreads(model: Model, said: Predicted, class_ids: NDArray[np.int64]) -> dict[str, Spread]:
+def predict_spreads(model: Model, said: Predicted, found: Measured) -> dict[str, Spread]:
     """Return what is known of the errors of a model's costs, by quantity; nothing if it has too few held-out samples."""
     if model.errors is None:
         return {}
-    found = {}
+    is_near = None
+    if found.split.has_coordinates:
+        is_near = model.find_near(compute_middles([found.split.column(name) for name in PLACES]))
+    spreads = {}
     for quantity, costs in said.costs.items():
-        errors, d = (
-            model.errors[CALLED[quantity]],
-            model.card.chord_m if quantity in "TE" else 1.0,
-        )  # errors are of a metre
-        ground = costs / d, class_ids, said.stated[quantity] / d
+        errors, d = model.errors[CALLED[quantity]], model.card.chord_m if quantity in "TE" else 1.0
+        ground = costs / d, found.class_ids, said.stated[quantity] / d, is_near  # errors are of a metre
         low, high = errors.compute_intervals(*ground)
-        found[quantity] = Spread(d * errors.compute_std(*ground), d * low, d * high)
-    return found
+        spreads[quantity] = Spread(d * errors.compute_std(*ground), d * low, d * high)
+    return spreads
 
 
-def check_origin(card: ModelCard, data: Dataset, name: str) -> None:
-    """Raise an error if a model was trained on another dataset, which does not tell what it has seen."""
-    if compute_dataset_checksum(data.card) != card.dataset.sha256:
-        raise ModelError(
-            f"{name}: was trained on another dataset ({card.dataset.name}, {card.dataset.sha256[:12]}) than {data.path}; "
-            "expected that one, to find out whether a drive was held back"
-        )
-
-
-def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = False) -> None:
-    """Raise an error with every reason for which a model cannot be asked about a dataset, of another robot too if that may be."""
+def check_fit(card: ModelCard, data: Dataset, name: str) -> None:
+    """Raise an error with every reason for which a model cannot be asked about a dataset."""
     dataset_card = data.card
     problems = [
         f"classes: in the model {clause}"
@@ -182,7 +138,7 @@ def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = Fa
         ("patch_m", card.inputs.patch_m, dataset_card.patch_m),
         ("segment.chord_m", card.chord_m, dataset_card.recipe.segment.chord_m),
         ("label.velocity", card.label_velocity, dataset_card.label.velocity),
-        *(() if any_robot else (("robot", card.robot, ", ".join(dataset_card.robots)),)),
+        ("robot", card.robot, ", ".join(dataset_card.robots)),
     )
     problems += [
         f"{key} is {mine!r} in the model, {theirs!r} in the dataset" for key, mine, theirs in same if mine != theirs
@@ -194,49 +150,6 @@ def check_fit(card: ModelCard, data: Dataset, name: str, *, any_robot: bool = Fa
     problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
     if problems:
         raise ModelError(*(f"{name} does not fit {data.path}: {problem}" for problem in problems))
-
-
-def collect_runs(model: Model, data: Dataset) -> list[Run]:
-    """Return the labelled samples of each run that the model was not trained on, in order: all runs of another dataset than its own."""
-    is_own = compute_dataset_checksum(data.card) == model.card.dataset.sha256
-    parts: list[dict[str, NDArray[Any]]] = []
-    for name in ("test", "unseen") if is_own else ("train", "test", "unseen"):
-        part = collect_measured(data[name], {})
-        said, features = predict_costs(model, part.split), read_extra_features(part.split)
-        parts.append(
-            {name: part.split.column(name) for name in ("run_id", "start_ns", "arc_length_m")}
-            | {name: getattr(features, name) for name in ("class_id", "slope_rad", "turn_radpm")}
-            | {
-                f"{what} {q}": costs[q]
-                for what, costs in (("measured", part.costs), ("predicted", said.costs))
-                for q in "TE"
-            }
-        )
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    order, found = np.lexsort((columns["start_ns"], columns["run_id"].astype(np.str_))), list[Run]()
-    columns = {name: values[order] for name, values in columns.items()}
-    for run in np.unique(columns["run_id"]).tolist():
-        here = columns["run_id"] == run
-        run_columns = {name: values[here].astype(np.float64) for name, values in columns.items() if name != "run_id"}
-        step_m = (
-            np.diff(run_columns["start_ns"]) * 1e-9 * (run_columns["arc_length_m"] / run_columns["measured T"])[:-1]
-        )
-        length_m = run_columns["arc_length_m"]
-        metres = {
-            CALLED[q]: Metres(
-                run_columns[f"predicted {q}"],
-                run_columns[f"measured {q}"],
-                run_columns["class_id"].astype(np.int64),
-                np.insert(np.cumsum(step_m), 0, 0.0),
-                length_m,
-                run_columns["predicted T"],
-                length_m * np.tan(run_columns["slope_rad"]),
-                run_columns["turn_radpm"] * length_m,
-            )
-            for q in "TE"
-        }
-        found.append(Run(str(run), metres))
-    return found
 
 
 _SUFFIX = {"w": "watt", "v": "mps", "T": "s", "E": "joule"}

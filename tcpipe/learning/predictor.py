@@ -13,8 +13,8 @@ class; only ``predict`` is needed, ``fit`` to be trained, and ``to_arrays`` with
 
 ``patches`` are float32 (N, px, px, channels) in [0, 1], travel to the right; ``features`` (`tcpipe.dataset.extra_features.ExtraFeatures`)
 has slope, terrain class, turn and commanded speed of each. Intervals come from predictions of samples that a model was not fitted to:
-``fit`` is called for the other folds of each fold, unless the class has ``fit_folds``. Their errors are the covariance of a model that
-states none, and scale that of one that does (`tcpipe.cost.prediction_errors`): one rule for all.
+``fit`` is called for the other folds of each fold, unless the class has ``fit_folds``, and for the other runs of each fifth of the runs.
+Their errors are the covariance of a model that states none, and scale that of one that does (`tcpipe.cost.prediction_errors`).
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ class Inputs:
     extra_features: tuple[ExtraFeature, ...]
     """Features besides slope and class that are known, with their distribution over the training samples."""
     outputs: tuple[str, ...]
-    """Columns: power and velocity, velocity alone (a dataset without power), or energy alone (a baseline)."""
+    """Columns: power and velocity, or velocity alone (a dataset without power)."""
     scale: tuple[float, ...]
     """Largest label of each output in train."""
 
     @property
     def is_time_alone(self) -> bool:
         """Whether it predicts velocity and so time, but no power."""
-        return len(self.outputs) == 1 and self.outputs[0].endswith("velocity_mps")
+        return len(self.outputs) == 1
 
     @property
     def depth(self) -> int:
@@ -73,7 +73,7 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Outputs of N metres of ground, power [W] and velocity [m/s] or energy [J], and the covariances of their errors."""
+    """Outputs of N metres of ground, power [W] and velocity [m/s], and the covariances of their errors."""
 
     mean: Floats
     """Shape (N, outputs)."""
@@ -133,14 +133,12 @@ class Samples:
     @cached_property
     def labels(self) -> Floats:
         """What is to be predicted, shape (N, outputs)."""
-        outputs = self.inputs.outputs
-        labels = self.split.column(outputs[0]).astype(np.float32)[:, None] if len(outputs) == 1 else self.split.labels
-        return labels.astype(np.float64)
+        return self.split.labels.astype(np.float64)
 
     @cached_property
     def weights(self) -> Floats:
         """Weight of each label, shape (N, outputs); 1 unless --inverse-variance-weights is given."""
-        weighed = self.config.inverse_variance_weights and self.split.weights.shape == self.labels.shape
+        weighed = self.config.inverse_variance_weights
         return self.split.weights.astype(np.float64) if weighed else np.ones_like(self.labels)
 
     @property
@@ -187,7 +185,7 @@ class Predictor(Protocol):
     """Whether one fold of train stops its training, and the others alone are fitted."""
 
     def predict(self, patches: Patches, features: ExtraFeatures) -> Labels | tuple[Labels, Labels]:
-        """Return outputs of N metres of ground, shape (N, outputs): power [W] and velocity [m/s], or energy [J].
+        """Return outputs of N metres of ground, shape (N, outputs): power [W] and velocity [m/s].
 
         Or these and the covariances of their errors, shape (N, outputs, outputs), in squares and products of these units.
         """
@@ -216,9 +214,7 @@ class Predictor(Protocol):
 
 
 KINDS: Mapping[ModelKind, str] = {
-    "mean": "tcpipe.learning.physics_model:MeanModel",
     "linear": "tcpipe.learning.physics_model:CurveModel",
-    "spline": "tcpipe.learning.physics_model:SplineModel",
     "physics": "tcpipe.learning.physics_model:PhysicsModel",
     "boosting": "tcpipe.learning.table_model:BoostingModel",
     "resnet18": "tcpipe.learning.network_model:NetworkModel",
@@ -227,7 +223,7 @@ KINDS: Mapping[ModelKind, str] = {
 """Class of each kind, simplest first; a class is imported when it is needed."""
 
 
-AUTOMATIC: tuple[ModelKind, ...] = ("mean", "linear", "spline", "physics", "boosting")
+AUTOMATIC: tuple[ModelKind, ...] = ("linear", "physics", "boosting")
 """Kinds of which one is chosen where none is asked for, simplest first."""
 
 

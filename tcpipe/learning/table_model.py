@@ -19,15 +19,16 @@ Mirroring a patch across its travel changes none of them. A pixel without data c
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import compile_kernel
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeatures, standardize_features
 from tcpipe.errors import ModelError
@@ -83,6 +84,12 @@ def find_slope_and_class(
         elif channel == "terrain":
             class_id = features[:, at : at + class_count].argmax(axis=1) + 1
     return slope, class_id
+
+
+def _count_features(channels: Sequence[str], class_count: int) -> int:
+    """Return how many features the channels have together."""
+    last = list(_locate_features((*channels, ""), class_count))[-1]
+    return last[1]
 
 
 def _is_band(channel: str) -> bool:
@@ -145,9 +152,6 @@ def _compute_class_shares(values: Patches, class_count: int) -> Floats:
     return np.asarray(counts.reshape(len(values), class_count) / (values.shape[1] * values.shape[2]))
 
 
-Indices = NDArray[np.uint32]
-
-
 def make_rules(config: TrainConfig) -> dict[str, str | float | bool]:
     """Return the settings of LightGBM: the same bytes on any number of cores; nothing random."""
     return {
@@ -157,75 +161,62 @@ def make_rules(config: TrainConfig) -> dict[str, str | float | bool]:
     }  # fmt: skip
 
 
-_ROWS_TOGETHER = 256
-
-
-@dataclass(frozen=True, slots=True)
-class Forest:
-    """Trees whose nodes are stored one after another; an output is the sum of one leaf of each of its trees."""
-
-    feature: Indices
-    """What a node asks for."""
-    threshold: Floats
-    """Up to it the first child follows, else the second."""
-    child: Indices
-    """Both, shape (nodes, 2); a leaf has itself."""
-    value: Floats
-    """Of a leaf, in the output's unit."""
-    root: Indices
-    """First node of each tree."""
-    depth: Indices
-    """Steps to the farthest leaf of each tree."""
-    output: Indices
-    """That each tree adds to."""
-
-    def predict(self, features: Floats) -> Floats:
-        """Return outputs, shape (N, outputs), of features, shape (N, features); `ModelError` where a node asks for another one."""
-        if self.feature.max(initial=0) >= features.shape[1]:
-            raise ModelError(
-                f"trees of {self.feature.max() + 1} features or more, got {features.shape[1]}; train the model again"
-            )
-        out = np.zeros((len(features), int(self.output.max()) + 1))
-        _descend(np.ascontiguousarray(features), *(getattr(self, entry.name) for entry in fields(self)), out)
-        return out
-
-    def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return everything by name, as `read_forest` takes it."""
-        return asdict(self)
-
-
-_INDICES, _NUMBERS = ("uint32", ("nodes",)), ("float64", ("nodes",))
-_FOREST_FORMS: Mapping[str, ArrayForm] = {
-    "feature": _INDICES, "threshold": _NUMBERS, "child": ("uint32", ("nodes", 2)), "value": _NUMBERS,
-    "root": ("uint32", ("trees",)), "depth": ("uint32", ("trees",)), "output": ("uint32", ("trees",)),
-}  # fmt: skip
-"""Types and shapes of a forest's arrays."""
+_NO_COMPONENTS = {"centre": np.empty(0), "axes": np.empty((0, 0))}
 _COMPONENT_FORMS: Mapping[str, ArrayForm] = {
     "centre": ("float64", ("features",)),
     "axes": ("float64", ("components", "features")),
 }
-_NO_COMPONENTS = {"centre": np.empty(0), "axes": np.empty((0, 0))}
-_MOST_FEATURES, _MOST_DEPTH, _MOST_OUTPUTS = 100_000, 64, 1024
+
+_HEADER = (
+    "tree\nversion=v4\nnum_class=1\nnum_tree_per_iteration=1\nlabel_index=0\nmax_feature_idx={last}\nobjective=regression\n"
+    "feature_names={names}\nfeature_infos={infos}\n\n"
+)
+_TREE = re.compile(
+    r"Tree=\d+\nnum_leaves=(\d+)\nnum_cat=0\nsplit_feature=([\d ]*)\n(?:split_gain=.*\n)?threshold=(.*)\ndecision_type=([2 ]*)\n"
+    r"left_child=([\d -]*)\nright_child=([\d -]*)\nleaf_value=(.*)\n(?:(?:leaf|internal)_.*\n)*is_linear=0\nshrinkage=.*\n+",
+    re.ASCII,
+)
+_WRITTEN = (
+    "Tree={}\nnum_leaves={}\nnum_cat=0\nsplit_feature={}\nthreshold={}\ndecision_type={}\n"
+    "left_child={}\nright_child={}\nleaf_value={}\nis_linear=0\nshrinkage=1\n\n\n"
+)
+_END = "end of trees\n"
 
 
-def read_forest(arrays: Mapping[str, NDArray[Any]]) -> Forest:
-    """Return the forest of `Forest.arrays`, of these forms; `ModelError` if no training makes it."""
-    made = Forest(**arrays)
-    nodes = len(made.feature)
-    most = {
-        "child": nodes, "root": nodes, "feature": _MOST_FEATURES, "output": _MOST_OUTPUTS, "depth": _MOST_DEPTH,
-    }  # fmt: skip
-    if not made.root.size or any((getattr(made, name) >= bound).any() for name, bound in most.items()):
-        raise ModelError("contains trees with invalid nodes; train the model again")
-    if not (np.isfinite(made.threshold).all() and np.isfinite(made.value).all()):
-        raise ModelError("contains trees with numbers that are not finite; train the model again")
-    return made
+def clean_trees(text: str, features: int) -> str:
+    """Return a text model of LightGBM with only what predictions need; `ModelError` where its reader would follow a wrong index."""
+    body = text[text.find("Tree=") : text.rfind(_END)]
+    found, parts = list(_TREE.finditer(body)), list[str]()
+    if not found or sum(len(match[0]) for match in found) != len(body):
+        raise ModelError("contains trees that no training makes; train the model again")
+    for number, match in enumerate(found):
+        leaves, (split, threshold, decision, left, right, value) = int(match[1]), match.groups()[1:]
+        try:
+            feature, children = np.array(split.split(), np.int64), np.array([left.split(), right.split()], np.int64)
+            limits, values = (np.array(numbers.split(), np.float64) for numbers in (threshold, value))
+        except (ValueError, OverflowError):
+            raise ModelError("contains trees with numbers that cannot be read; train the model again") from None
+        nodes = np.arange(leaves - 1)
+        sizes = len(feature), len(limits), len(decision.split()), children.shape[1], len(values) - 1
+        if set(sizes) != {nodes.size} or (feature >= features).any():
+            raise ModelError("contains trees with invalid nodes; train the model again")
+        if ((children >= nodes.size) | (children < -leaves) | ((children >= 0) & (children <= nodes))).any():
+            raise ModelError("contains trees with invalid nodes; train the model again")
+        if not (np.isfinite(limits).all() and np.isfinite(values).all()):
+            raise ModelError("contains trees with numbers that are not finite; train the model again")
+        lines = feature, limits, np.full(nodes.size, 2), *children, values
+        parts.append(_WRITTEN.format(number, leaves, *(" ".join(map(repr, line.tolist())) for line in lines)))
+    names = " ".join(f"f{number}" for number in range(features))
+    head = _HEADER.format(last=features - 1, names=names, infos=" ".join(["none"] * features))
+    return head + "".join(parts) + _END
 
 
 def grow(
     features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.generic], config: TrainConfig | None = None
-) -> tuple[Forest, Floats]:
-    """Fit trees of every output, as many as are best where each fold is predicted by the others; return these predictions, too.
+) -> tuple[tuple[str, ...], Floats, int]:
+    """Fit trees of every output, as many as are best where each fold is predicted by the others.
+
+    Returns LightGBM's text of each output, these predictions, and the largest number of trees of an output.
 
     Parameters
     ----------
@@ -237,7 +228,7 @@ def grow(
         Of each sample, shape (N,); at least two.
     """
     config = config or TrainConfig()
-    lightgbm, held_out, trees = _load_lightgbm(), np.empty(labels.shape), list[tuple[Mapping[str, Any], int]]()
+    lightgbm, held_out, trees, largest = _load_lightgbm(), np.empty(labels.shape), list[str](), 1
     rules, most = make_rules(config), config.trees
     for number, (label, weight) in enumerate(zip(labels.T, weights.T, strict=True)):
         errors, by_fold = np.zeros(most), []
@@ -255,86 +246,46 @@ def grow(
         for held, booster in by_fold:
             held_out[held, number] = booster.predict(features[held], num_iteration=rounds)
         whole = lightgbm.train(rules, lightgbm.Dataset(features, label, weight=weight), rounds)
-        trees += [(tree["tree_structure"], number) for tree in whole.dump_model()["tree_info"]]
-    return _make_forest(trees), held_out
-
-
-def _make_forest(trees: Sequence[tuple[Mapping[str, Any], int]]) -> Forest:
-    """Return trees of LightGBM's dump, each with its output, as arrays."""
-    nodes: list[tuple[int, float, tuple[int, int], float]] = []
-
-    def add_node(node: Mapping[str, Any]) -> int:
-        """Append a node and all below it; return how many steps that goes down."""
-        at = len(nodes)
-        nodes.append((0, 0.0, (at, at), float(node.get("leaf_value", 0.0))))
-        if "leaf_value" in node:
-            return 0
-        below = add_node(node["left_child"])
-        second = len(nodes)
-        below = max(below, add_node(node["right_child"]))
-        nodes[at] = int(node["split_feature"]), float(node["threshold"]), (at + 1, second), 0.0
-        return 1 + below
-
-    roots = [(len(nodes), add_node(tree), output) for tree, output in trees]
-    feature, threshold, child, value = zip(*nodes, strict=True)
-    root, depth, output = np.array(roots, np.uint32).T.copy()
-    indices = np.array(feature, np.uint32), np.array(child, np.uint32)
-    return Forest(indices[0], np.array(threshold), indices[1], np.array(value), root, depth, output)
+        trees.append(clean_trees(whole.model_to_string(), features.shape[1]))
+        largest = max(largest, whole.num_trees())
+    return tuple(trees), held_out, largest
 
 
 def _load_lightgbm() -> Any:
     try:
         import lightgbm  # noqa: PLC0415  asked for here alone
     except ImportError:
-        raise ModelError("lightgbm not installed, required to train a table: pip install 'tcpipe[tables]'") from None
+        raise ModelError("lightgbm not installed, required by boosting: pip install 'tcpipe[tables]'") from None
     except OSError as error:
         raise ModelError(f"lightgbm cannot be loaded ({error}); install the system's package libgomp1") from None
     return lightgbm
 
 
-@compile_kernel
-def _descend(  # noqa: PLR0917
-    features: Floats,
-    feature: Indices,
-    threshold: Floats,
-    child: Indices,
-    value: Floats,
-    root: Indices,
-    depth: Indices,
-    output: Indices,
-    out: Floats,
-) -> None:
-    """Add the leaf values of each row to ``out``, (N, outputs); all rows descend a tree together, without branches."""
-    at = np.empty(_ROWS_TOGETHER, np.uint32)
-    for first in range(0, features.shape[0], _ROWS_TOGETHER):
-        rows = features[first : first + _ROWS_TOGETHER]
-        for tree in range(root.size):
-            at[:] = root[tree]
-            for _ in range(depth[tree]):
-                for n in range(rows.shape[0]):
-                    node = at[n]
-                    at[n] = child[node, np.uint32(rows[n, feature[node]] > threshold[node])]
-            for n in range(rows.shape[0]):
-                out[first + n, output[tree]] += value[at[n]]
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TableModel:
     """Curves and trees; ``channels`` and ``class_count`` say where slope and class stand in the features."""
 
     curves: Curves
-    forest: Forest
+    trees: tuple[str, ...]
+    """LightGBM's text of each output."""
     channels: tuple[str, ...]
     class_count: int
+
+    @cached_property
+    def _boosters(self) -> list[Any]:
+        return [_load_lightgbm().Booster(model_str=text) for text in self.trees]
 
     def predict(self, features: Floats) -> Floats:
         """Return outputs, shape (N, outputs), of features, shape (N, features)."""
         slope_rad, class_id = find_slope_and_class(features, self.channels, self.class_count)
-        return self.curves.predict(slope_rad, class_id) + self.forest.predict(features)
+        curves = self.curves.predict(slope_rad, class_id)
+        found = [np.asarray(booster.predict(features, num_threads=1)) for booster in self._boosters]
+        return np.asarray(curves + np.column_stack(found))
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return curves and trees by name."""
-        return {**self.forest.arrays(), **self.curves.arrays()}
+        texts = {f"trees_{at}": np.frombuffer(text.encode(), np.uint8) for at, text in enumerate(self.trees)}
+        return {**texts, **self.curves.arrays()}
 
 
 def fit_table(
@@ -346,8 +297,10 @@ def fit_table(
     channels: Sequence[str],
     class_count: int,
     config: TrainConfig | None = None,
-) -> tuple[TableModel, Floats]:
-    """Fit curves, and trees to the residuals of curves of the other folds; return also each sample's prediction by the other folds.
+) -> tuple[TableModel, Floats, int]:
+    """Fit curves, and trees to the residuals of curves of the other folds.
+
+    Returns also each sample's prediction by the other folds, and the largest number of trees of an output.
 
     Parameters
     ----------
@@ -359,9 +312,9 @@ def fit_table(
     """
     slope_rad, class_id = find_slope_and_class(features, channels, class_count)
     curve_labels = cross_fit_curves(slope_rad, class_id, labels, folds)
-    forest, held_out = grow(features, labels - curve_labels, weights, folds, config)
+    trees, held_out, count = grow(features, labels - curve_labels, weights, folds, config)
     curves = fit_curves("linear", slope_rad, class_id, labels)
-    return TableModel(curves, forest, tuple(channels), class_count), curve_labels + held_out
+    return TableModel(curves, trees, tuple(channels), class_count), curve_labels + held_out, count
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,12 +348,14 @@ class BoostingModel(Predictor):
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> BoostingModel:
         """Return the model of these arrays."""
-        forms = {**_FOREST_FORMS, **list_curve_arrays(len(inputs.outputs))}
-        check_arrays(arrays, {**forms, **_COMPONENT_FORMS}, optional=_COMPONENT_FORMS)
-        components = {name: array for name, array in arrays.items() if name in _COMPONENT_FORMS}
-        curves, rest = read_curves("linear", {name: array for name, array in arrays.items() if name not in components})
-        table = TableModel(curves, read_forest(rest), inputs.planes, inputs.class_count)
-        return cls(table, inputs, Components(**{**_NO_COMPONENTS, **components}))
+        texts: dict[str, ArrayForm] = {f"trees_{at}": ("uint8", (f"bytes_{at}",)) for at in range(len(inputs.outputs))}
+        forms = {**texts, **list_curve_arrays(len(inputs.outputs)), **_COMPONENT_FORMS}
+        check_arrays(arrays, forms, optional=_COMPONENT_FORMS)
+        components = Components(*(arrays.get(name, empty) for name, empty in _NO_COMPONENTS.items()))
+        curves, _ = read_curves("linear", {name: array for name, array in arrays.items() if name.startswith("curve_")})
+        known = _count_features(inputs.planes, inputs.class_count) + len(components.axes) + len(inputs.extra_features)
+        trees = tuple(clean_trees(arrays[name].tobytes().decode(errors="replace"), known) for name in texts)
+        return cls(TableModel(curves, trees, inputs.planes, inputs.class_count), inputs, components)
 
     @classmethod
     def fit(cls, samples: Samples) -> Predictor:
@@ -418,7 +373,7 @@ class BoostingModel(Predictor):
         components = fit_components(plain, inputs.planes, inputs.class_count)
         features = np.column_stack([components.append(plain), numbers])
         fed_s = time.perf_counter() - began
-        table, held_out = fit_table(
+        table, held_out, trees = fit_table(
             features,
             samples.labels,
             samples.weights,
@@ -427,7 +382,6 @@ class BoostingModel(Predictor):
             class_count=inputs.class_count,
             config=samples.config,
         )
-        trees = int(np.bincount(table.forest.output).max())
         times = TrainingTimes(time.perf_counter() - began, fed_s, len(samples))
         return Fitted(
             cls(table, inputs, components),

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import make_residuals
+from tcpipe.cost.prediction_errors import FEWEST, NEAR, make_residuals
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import name_common_std
 from tcpipe.dataset.extra_features import ExtraFeature, available_features, read_extra_features
@@ -27,7 +27,7 @@ from tcpipe.formats.published_outputs import fetch_directory, find_newest, write
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, compute_costs
 from tcpipe.learning.model_card import KIND, LayerRange, ModelCard, TrainedOn, Training, TrainingRange, format_readme
-from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
+from tcpipe.learning.models import CARD, FILES, GROUND_COLUMNS, load_model, read_model_card, write_model
 from tcpipe.learning.own_models import load_own_kind, report_errors
 from tcpipe.learning.physics_model import find_idle_power
 from tcpipe.learning.predictor import (
@@ -43,6 +43,7 @@ from tcpipe.learning.predictor import (
     find_held_out,
     find_kind,
 )
+from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles
 from tcpipe.terrain.layers import COLOURS, LAYERS, NODATA_ID, PAPER_CLASSES, PAPER_LAYERS, ClassTable
 from tcpipe.terrain.sampling import compute_relief_m
 
@@ -51,18 +52,6 @@ logger = logging.getLogger("tcpipe")
 _READ_TOGETHER = 1024
 
 _CALLED = {"turn_radpm": "turn (mean_abs_yaw_rate_radps)", "command_mps": "commanded speed (commanded_velocity_mps)"}
-
-
-@dataclass(frozen=True, slots=True)
-class Variant:
-    """What a network for a baseline is trained on."""
-
-    channels: tuple[str, ...] = ()
-    """Of the patch; empty: all that the dataset has."""
-    classes: tuple[int, ...] = ()
-    """Only samples of these terrain classes; empty: all."""
-    energy_only: bool = False
-    """One output, E, instead of w and v."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,25 +86,25 @@ class TrainResult:
         )
 
 
-_MOST_FOLDS, _FEWEST_RUNS = 5, 5
-"""Parts of the runs that are predicted by the others; runs below which their folds are what errs alike."""
+_PARTS = 5
+"""Parts of the runs that are predicted by the others; of fewer runs, folds are what errs alike."""
 
 
-def choose_kind(data: Dataset, config: FitConfig, variant: Variant, split: Split | None = None) -> ModelKind:
+def choose_kind(data: Dataset, config: FitConfig, split: Split | None = None) -> ModelKind:
     """Return the simplest kind that predicts other runs as well as the best one, within a standard error of the difference (ADR-23).
 
     Each part of the runs is predicted by models of the others; of a single run, each fold. The loss is the squared error of time and of
     energy, each over its variance. ``split`` are labelled samples of train, by default all.
     """
-    split = select_train(data, variant) if split is None else split
+    split = select_train(data, config) if split is None else split
     runs, folds = (np.unique(split.column(name), return_inverse=True)[1] for name in ("run_id", "fold"))
-    part = runs % _MOST_FOLDS if runs.any() else folds
-    clusters = runs if runs.max() + 1 >= _FEWEST_RUNS else runs * (folds.max() + 1) + folds
+    part = runs % _PARTS if runs.any() else folds
+    clusters = runs if runs.max() + 1 >= _PARTS else runs * (folds.max() + 1) + folds
     losses: dict[ModelKind, Array] = {}
     for name in AUTOMATIC:
         kind = find_kind(name)
         try:
-            samples = make_samples(data, config, variant, kind, split)
+            samples = make_samples(data, config, kind, split)
             losses[name] = _compute_losses(samples, cross_predict(kind, samples, part).mean)
         except ModelError as error:
             logger.info("%s is not compared: %s", name, error.problems[0])
@@ -153,7 +142,6 @@ def train(
     out: str | Path = "model",
     *,
     config: FitConfig | None = None,
-    variant: Variant | None = None,
     no_resume: bool = False,
     predictor: str | None = None,
 ) -> TrainResult:
@@ -166,11 +154,10 @@ def train(
         bucket, where it becomes the newest build. ``<out>.KEY.checkpoint`` beside a folder keeps the state, so that a training
         continues; another dataset, or other options, have another one.
     config : the options.
-    variant : what another network than the paper's is trained on.
     no_resume : ignore an earlier state.
     predictor : code of the user, ``FILE.py[:NAME]`` or an entry point, that is fitted instead of a shipped kind.
     """
-    rules, other = config or FitConfig(), variant or Variant()
+    rules = config or FitConfig()
     own = None if predictor is None else load_own_kind(predictor)
     rules = rules if own is None else replace(rules, model="own", predictor=own.digest)
     data = open_dataset(dataset, label=rules.label)
@@ -179,10 +166,9 @@ def train(
             f"{data.path}: has no patches, which a model is trained on; build it with a map (tcpipe add-map) and without "
             "--without-patches, or train your own model on its samples.parquet"
         )
-    other = replace(other, channels=other.channels or rules.layers)
-    key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
+    key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules)})
     if is_url(out):
-        again = partial(train, dataset, config=rules, variant=other, predictor=predictor)
+        again = partial(train, dataset, config=rules, predictor=predictor)
         return _train_into_bucket(str(out).rstrip("/"), key, again)
     place = Path(out)
     clear_beside(place)
@@ -193,26 +179,28 @@ def train(
     elif (known := _read_known_model(place, predictor)) is not None and known.training.key == key:
         checkpoint.unlink(missing_ok=True)  # of a training that was killed after it wrote its model
         return _make_result(place, "unchanged", known.training, TrainingTimes())
-    name = choose_kind(data, rules, other) if rules.model == "auto" else rules.model
+    name = choose_kind(data, rules) if rules.model == "auto" else rules.model
     kind = find_kind(name) if own is None else own.kind
     if kind.channels and rules.layers and rules.model != "auto":
         raise UsageError(f"--layers: a model of kind {name} takes the slope and class of a metre, no patch; remove it")
     if kind.channels:
         level = logging.WARNING if rules.layers else logging.INFO
         logger.log(level, "%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, name)
-    elif variant is None:
-        _report_layers(data, other.channels or data["train"].channels, is_chosen=bool(other.channels))
-    samples = make_samples(data, rules, other, kind)
+    else:
+        _report_layers(data, rules.layers or data["train"].channels, is_chosen=bool(rules.layers))
+    samples = make_samples(data, rules, kind)
     _reject_other_files(place)
     with report_errors(own):
         fitted = kind.fit_folds(samples, Job(str(place), checkpoint))
+        near = _predict_near(kind, samples, CLOSE * data.card.recipe.segment.chord_m)
         weights = {name: np.asarray(array) for name, array in kind.to_arrays(fitted.predictor).items()}
     if own is not None and (missing := int((~find_held_out(fitted.held_out)).sum())):
         raise ModelError(f"--predictor {predictor}: no finite prediction of {missing} of {len(samples)} samples")
     card = _make_card(data, samples, fitted, key, name)
     history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.history)
     write_model(
-        place, card=card, weights=weights, residuals=_make_residuals_table(samples, fitted.held_out),
+        place, card=card, weights=weights, residuals=_make_residuals_table(samples, fitted, near),
+        ground=pa.table(dict(zip(GROUND_COLUMNS, _find_middles(_select_used(samples, fitted)).T, strict=True))),
         history="epoch,loss,held_out_loss\n" + history, readme=format_readme(card),
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
@@ -249,34 +237,29 @@ def compute_dataset_checksum(card: DatasetCard) -> str:
     return digest(card.checksums)
 
 
-def select_train(data: Dataset, variant: Variant, kind: type[Predictor] = Predictor) -> Split:
+def select_train(data: Dataset, rules: FitConfig, kind: type[Predictor] = Predictor) -> Split:
     """Return the labelled samples of train that a kind of model is fitted to; `DatasetError` where there are none."""
     train = data["train"]
     wanted = np.isfinite(train.labels).all(axis=1)
     if unlabelled := len(train) - int(wanted.sum()):
         logger.info("%s: %d of %d samples of train have no label and are not used", data.path, unlabelled, len(train))
-    if variant.classes:
-        wanted &= np.isin(train.column("terrain_class"), variant.classes)
     train = train.take(wanted)
     if not len(train):
         raise DatasetError(
             f"{data.path}: no labelled samples in split train; check that its region (--split) contains runs"
         )
-    channels = kind.channels or variant.channels
+    channels = kind.channels or rules.layers
     return train.with_channels(*channels) if channels else train
 
 
-def make_samples(
-    data: Dataset, rules: FitConfig, variant: Variant, kind: type[Predictor], train: Split | None = None
-) -> Samples:
+def make_samples(data: Dataset, rules: FitConfig, kind: type[Predictor], train: Split | None = None) -> Samples:
     """Return what a model of a kind is fitted to: labelled samples ``train``, or all that `select_train` finds, which need folds."""
     needs_folds = train is None
     if train is None:
-        train = select_train(data, variant, kind)
+        train = select_train(data, rules, kind)
     elif kind.channels:
         train = train.with_channels(*kind.channels)
-    outputs = (train.energy.energy,) if variant.energy_only else train.label_columns
-    folds = train.column("fold")
+    outputs, folds = train.label_columns, train.column("fold")
     fitted = train.take(folds != rules.fold)
     is_lacking = len(fitted) in {0, len(train)} if kind.stops_by_fold else len(np.unique(folds)) < 2
     if needs_folds and is_lacking:
@@ -288,15 +271,15 @@ def make_samples(
             f"expected both (there are folds {', '.join(map(str, np.unique(folds)))}; {cure})"
         )
     used = fitted if kind.stops_by_fold else train
-    if rules.inverse_variance_weights and not variant.energy_only:
+    if rules.inverse_variance_weights:
         unstated = [label for label, weights in zip(outputs, used.weights.T, strict=True) if not weights.any()]
         if unstated:
             raise DatasetError(
                 f"{data.path}: no sample has a standard deviation of {', '.join(unstated)} to weigh it by; "
                 "train without --inverse-variance-weights"
             )
-    extra_features: tuple[ExtraFeature, ...] = ()  # a network of energy alone takes none
-    if kind.features or (kind.features is None and rules.extra_features and not variant.energy_only):
+    extra_features: tuple[ExtraFeature, ...] = ()
+    if kind.features or (kind.features is None and rules.extra_features):
         extra_features = _find_extra_features(used, kind.features, data)
     inputs = Inputs(
         channels=train.channels, patch_px=data.card.patch_px, planes=train.view.form.planes, patch_m=data.card.patch_m,
@@ -379,9 +362,7 @@ def _make_result(place: Path | str, status: str, training: Training, times: Trai
 def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str, kind: ModelKind) -> ModelCard:
     card, config, inputs = data.card, samples.config, samples.inputs
     is_held = find_held_out(fitted.held_out)
-    is_network = getattr(fitted.predictor, "stops_by_fold", False)
-    used = samples.split.take(samples.folds != config.fold) if is_network else samples.split
-    held = samples.take(is_held)
+    used, held = _select_used(samples, fitted), samples.take(is_held)
     own = [name for name in samples.split.view.form.layers if name not in PAPER_LAYERS]
     return ModelCard(
         inputs=inputs,
@@ -417,17 +398,43 @@ def read_class_table(card: DatasetCard) -> ClassTable:
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
 
-def _make_residuals_table(samples: Samples, held_out: Prediction) -> pa.Table:
+def _find_middles(split: Split) -> Array:
+    """Return longitude and latitude of the middle of each sample [deg], shape (N, 2); none of a dataset without coordinates."""
+    return compute_middles([split.column(name) for name in PLACES]) if split.has_coordinates else np.empty((0, 2))
+
+
+def _predict_near(kind: type[Predictor], samples: Samples, within_m: float) -> Prediction:
+    """Return predictions by models of other runs of the samples on ground that these drove, too; NaN for all others.
+
+    They show the errors of a new drive over ground of training. A network, and few runs, have none.
+    """
+    out = Prediction.without_covariance(np.full(samples.labels.shape, np.nan))
+    runs, middles = np.unique(samples.split.column("run_id"), return_inverse=True)[1], _find_middles(samples.split)
+    if kind.stops_by_fold or not len(middles) or runs.max() + 1 < _PARTS:
+        return out
+    for run in np.unique(runs):
+        own = runs == run
+        near = are_near(middles[own], middles[~own], within_m=within_m, in_degrees=True)
+        out.mean[np.flatnonzero(own)[near]] = 0.0
+    if (is_near := find_held_out(out)).sum() >= FEWEST:
+        out.mean[is_near] = cross_predict(kind, samples, runs % _PARTS).mean[is_near]
+    return out
+
+
+def _select_used(samples: Samples, fitted: Fitted) -> Split:
+    """Return the samples that a model is fitted to: of a network all but the fold that stopped it."""
+    is_network = getattr(fitted.predictor, "stops_by_fold", False)
+    return samples.split.take(samples.folds != samples.config.fold) if is_network else samples.split
+
+
+def _make_residuals_table(samples: Samples, fitted: Fitted, near: Prediction) -> pa.Table:
     """Return labels and predictions of what was held out, one row a sample."""
-    is_held, outputs = find_held_out(held_out), samples.inputs.outputs
+    held_out, is_held = fitted.held_out, find_held_out(fitted.held_out)
+
     held, said, labels = samples.split.take(is_held), held_out.take(is_held), samples.labels[is_held]
-    is_energy = outputs == (held.energy.energy,)
-    columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class", "fold")}
-    if not is_energy:
-        columns |= make_residuals(labels, said.mean, said.covariance)
-        # the common error of all labels is in no residual
-        columns |= {name: held.column(name) for name in ("duration_s", "duration_common_std_s")}
-        columns["energy_common_std_joule"] = held.column(name_common_std(held.energy.energy_std))
-    else:
-        columns |= {"energy_joule": labels[:, 0], "energy_predicted_joule": said.mean[:, 0]}
+    # the common error of all labels is in no residual
+    names = "sample_id", "run_id", "start_ns", "terrain_class", "fold", "duration_s", "duration_common_std_s"
+    columns = {name: held.column(name) for name in names} | make_residuals(labels, said.mean, said.covariance)
+    columns |= dict(zip(NEAR[-near.mean.shape[1] :], near.take(is_held).mean.T, strict=True))
+    columns["energy_common_std_joule"] = held.column(name_common_std(held.energy.energy_std))
     return pa.table(columns)

@@ -52,7 +52,7 @@ from tcpipe.planning.cost_grid import (
     read_classes,
 )
 from tcpipe.planning.cost_model import Reason, check_model, iterate_predictions
-from tcpipe.planning.path_cost import find_origin_m
+from tcpipe.planning.frames import Frame, make_frame
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
 
@@ -64,7 +64,7 @@ Step: TypeAlias = Callable[[int, int], None]
 
 CARD = "cost-map.json"
 KIND = "tcpipe cost map"
-VERSION = "1.2"
+VERSION = "1.3"
 
 _BLOCKS_KEPT = 8
 """Blocks after which what is done is on disk."""
@@ -178,8 +178,8 @@ def make_cost_map(
     out : its directory: new, empty, or a cost map, which is replaced unless it is made from the same; or a URL in a bucket, where it
         becomes the newest build, and an interrupted call begins anew.
     cell_size_m : side of a cell in the map's plane [m].
-    origin_deg : longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own
-        without.
+    origin_deg : longitude and latitude of the origin of the Nav2 maps, whose axes are true east and north; without one they are in the
+        plane of the map's CRS.
     step : is told how many blocks of how many are done.
 
     Raises `ModelError` or `MapError` where the map lacks what the model needs, is smaller than a cell or cannot be read; `UsageError` or
@@ -197,7 +197,7 @@ def make_cost_map(
         return replace(made, path=url)
     out = Path(out)
     clear_beside(out)
-    grid, origin_m = make_grid(source, cell_size_m), find_origin_m(source, origin_deg)
+    grid, frame = make_grid(source, cell_size_m), make_frame(source, origin_deg)
     if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is no cost map; give another directory")
     with _claim_spool(out) as place:
@@ -211,7 +211,7 @@ def make_cost_map(
             costs = _predict_cells(model, source, place, key, grid, step)
         with write_atomic_directory(out) as directory:
             strips = _Strips(costs, model.errors, read_classes(source, grid))
-            scales = _write_files(directory, strips, origin_m)
+            scales = _write_files(directory, strips, frame)
             cells, shares = _compute_shares(costs)
             card = CostMapCard(
                 key=key, map=source.name, model=model.checksum, robot=model.card.robot, label_energy=model.card.label_energy, grid=grid,
@@ -319,7 +319,7 @@ def _read_job(place: Path) -> str | None:
         return None
 
 
-def _write_files(directory: Path, strips: _Strips, origin_m: tuple[float, float]) -> dict[str, Nav2Scale]:
+def _write_files(directory: Path, strips: _Strips, frame: Frame) -> dict[str, Nav2Scale]:
     """Write all files but the card; return the scales of the Nav2 maps."""
     costs, grid = strips.costs, strips.costs.grid
     for name, unit in _QUANTITIES.items():
@@ -340,7 +340,7 @@ def _write_files(directory: Path, strips: _Strips, origin_m: tuple[float, float]
         dtype="float32",
         bands=height,
     )
-    scales = {name: _write_nav2(directory / f"{name}.yaml", strips, name, origin_m) for name in ("duration", "energy")}
+    scales = {name: _write_nav2(directory / f"{name}.yaml", strips, name, frame) for name in ("duration", "energy")}
     for name, scale in scales.items():
         write_text(directory / f"{name}.qml", make_raster_style(_MEAN_BAND, scale.lowest, scale.highest))
     return scales
@@ -387,8 +387,8 @@ def _read_reasons(costs: CostGrid, first: int, last: int) -> NDArray[np.uint16]:
     return np.concatenate([bits, np.bitwise_and.reduce(bits, axis=0)[None]])
 
 
-def _write_nav2(path: Path, strips: _Strips, name: str, origin_m: tuple[float, float]) -> Nav2Scale:
-    """Write the mean over the trusted courses from 0 to `HIGHEST`; return what these two stand for."""
+def _write_nav2(path: Path, strips: _Strips, name: str, frame: Frame) -> Nav2Scale:
+    """Write the mean over the trusted courses from 0 to `HIGHEST` on a grid of the frame; return what these two stand for."""
     grid = strips.costs.grid
     mean = np.concatenate(
         [strips.compute(name, first, last)[_MEAN_BAND - 1] for first, last in iterate_row_strips(grid)]
@@ -401,7 +401,10 @@ def _write_nav2(path: Path, strips: _Strips, name: str, origin_m: tuple[float, f
     meaning = (
         f"{name} a metre, {AGGREGATION}: 0 is {low:.6g} {unit}, {HIGHEST} is {high:.6g} {unit}, {LETHAL} is not crossed"
     )
-    write_nav2_map(path, cost, grid, origin_m=origin_m, meaning=meaning)
+    own = frame.cover(grid)
+    cells, is_on = frame.find_cells(grid, own)
+    there = np.where(is_on, cost.reshape(-1)[cells], LETHAL).astype(np.uint8).reshape(own.rows, own.cols)
+    write_nav2_map(path, there, own, frame=frame.description, meaning=meaning)
     return Nav2Scale(low, high)
 
 

@@ -10,21 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.cost.adaptation import Metres, Run, predict
+from tcpipe.cost.adaptation import AdaptedErrors, Metres, Run, compare_adaptations, predict
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
-from tcpipe.errors import ModelError, UsageError, clean_lines
+from tcpipe.errors import DatasetError, ModelError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear
 from tcpipe.formats.dataset_card import list_shifts
 from tcpipe.formats.finding_lines import format_findings, list_verdict
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
-from tcpipe.formats.published_outputs import require_card, write_output
+from tcpipe.formats.published_outputs import open_output, require_card
 from tcpipe.formats.stored_runs import StoredRun
+from tcpipe.learning.evaluation import find_large_error
 from tcpipe.learning.models import Model
+from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.pipeline.dataset.map_checks import register_runs
 from tcpipe.planning.cost_model import Reason, check_model, predict_segments
 from tcpipe.planning.path_cost import find_added_turning
@@ -163,8 +165,9 @@ def predict_run(
         "energy": (energy, measured, said.energy_std_joule),
     }
     rise_m = length_m * np.tan(said.slope_rad)
+    is_near = model.find_near(compute_middles([to_floats(segments, name) for name in PLACES]))
     metres = {
-        name: Metres(predicted, label, class_id, distance_m, length_m, duration, rise_m, turn_rad, std)
+        name: Metres(predicted, label, class_id, distance_m, length_m, duration, rise_m, turn_rad, std, is_near)
         for name, (predicted, label, std) in both.items()
     }
     uncertain = np.hypot(values["position_std_m"], shift[2]) > (sample or SampleConfig()).max_position_std_m
@@ -299,7 +302,7 @@ class Drives:
 class DrivesResult:
     """Result and its path; the command prints its ``str``."""
 
-    path: Path | str
+    path: str
     values: Drives
 
     def __str__(self) -> str:
@@ -328,15 +331,8 @@ def evaluate_drives(
 
     Raises `ModelError`, `MapError` or `UsageError` where the model, the map or a drive cannot be used, or ``out`` is a file.
     """
-    if is_url(out):
-        with write_output(str(out), JSON) as made:
-            result = evaluate_drives(model, data, source, logs, store=store, out=made)
-        return replace(result, path=require_card(str(out), [JSON]).place.where())
-    place, opened = Path(out), open_store(store)
+    opened = open_store(store)
     runs = [find_drive(opened, log) for log in logs]
-    clear(place)
-    if place.exists() and not place.is_dir():
-        raise UsageError(f"{place}: is a file, expected a directory to write {JSON} into")
     shifts, moved = find_shifts(opened, source, data.card.recipe, runs, data)
     found = tuple(
         compute_drive_cost(model, source, run, data, log=log, shifts=shifts)
@@ -349,9 +345,81 @@ def evaluate_drives(
         duration_s=_sum([drive.duration_s for drive in held]), energy_joule=_sum([drive.energy_joule for drive in held]),
         findings=findings, verdict=judge(findings),
     )  # fmt: skip
-    place.mkdir(parents=True, exist_ok=True)
-    write_json(place / JSON, values)
-    return DrivesResult(place, values)
+    return DrivesResult(write_values(out, JSON, values), values)
+
+
+def write_values(out: str | Path, name: str, values: Drives | Adaptation) -> str:
+    """Write a document into the directory ``out``, or to a URL, and return where it is."""
+    if not is_url(out):
+        clear(Path(out))
+        if Path(out).exists() and not Path(out).is_dir():
+            raise UsageError(f"{out}: is a file, expected a directory to write {name} into")
+    with open_output(out, name) as place:
+        place.mkdir(parents=True, exist_ok=True)
+        write_json(place / name, values)
+    return require_card(str(out), [name]).place.where()
+
+
+def check_origin(model: Model, data: Dataset) -> None:
+    """Raise `ModelError` if a model was trained on another dataset, which does not show what it has seen."""
+    card = model.card
+    if compute_dataset_checksum(data.card) != card.dataset.sha256:
+        raise ModelError(
+            f"{model.name}: was trained on another dataset ({card.dataset.name}, {card.dataset.sha256[:12]}) than {data.path}; "
+            "expected that one, to find out whether a drive was held back"
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Adaptation:
+    """All of adaptation.json: errors on the rest of drives, after the first metres of each are known."""
+
+    kind: str = "tcpipe adaptation"
+    tcpipe_version: str = __version__
+    model: str
+    known_m: tuple[float, ...]
+    errors: tuple[AdaptedErrors, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptationResult:
+    """Result and its path; the command prints its ``str``."""
+
+    path: str
+    values: Adaptation
+
+    def __str__(self) -> str:
+        """Return the errors by known metres, as plain lines."""
+        return clean_lines((*map(str, self.values.errors), f"wrote {self.path}/adaptation.json"))
+
+
+def evaluate_adaptation(
+    model: Model,
+    data: Dataset,
+    source: MapFile,
+    logs: Sequence[str],
+    known_m: Sequence[float],
+    *,
+    store: str | Path,
+    out: str | Path,
+) -> AdaptationResult:
+    """Predict the rest of each drive after its first metres are known, and write ``adaptation.json`` into the directory ``out``."""
+    if not known_m or not all(0.0 <= metres < np.inf for metres in known_m):
+        raise UsageError(f"adapt: {known_m} are no metres of a run; expected some, as 0, 10, 50")
+    if (errors := model.errors) is None:
+        raise ModelError(
+            f"{model.name}: has too few held-out samples to state errors, which an adaptation weighs; train on more"
+        )
+    runs, known = collect_runs(model, source, open_store(store), logs, data), tuple(sorted(set(known_m)))
+    found = tuple(compare_adaptations({name: errors[name] for name in ("energy", "duration")}, runs, known))
+    if not found:
+        longest_m = max(float(run.metres["energy"].length_m.sum()) for run in runs)
+        raise DatasetError(
+            f"no drive has {max(known_m):g} m of labelled segments and more to predict, the longest has {longest_m:.0f} m; "
+            "give smaller values to --adapt"
+        )
+    values = Adaptation(model=model.name, known_m=known, errors=found)
+    return AdaptationResult(write_values(out, "adaptation.json", values), values)
 
 
 def _sum(parts: Sequence[IntervalComparison]) -> IntervalComparison:
@@ -372,9 +440,7 @@ def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Findin
     for name, quantity in (("time", "duration_s"), ("energy", "energy_joule")):
         sums: dict[str, IntervalComparison] = {drive.run_id: getattr(drive, quantity) for drive in compared}
         for run_id, comparison in sums.items():
-            error = abs(comparison.off_percent) / 100.0
-            if error >= read_threshold(f"{name}-far-off", "max_error_fraction"):
-                yield make_finding(f"{name}-far-off", Subject("run", run_id), error_fraction=error)
+            yield from find_large_error(abs(comparison.off_percent) / 100.0, name, Subject("run", run_id))
         if held := [comparison.held for comparison in sums.values() if comparison.held is not None]:
             yield from find_miscalibration(measure_coverage(np.array(held), np.arange(len(held))), name, model)
     if 0 < len(compared) < read_threshold("few-drives", "min_drive_count"):

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from pyarrow import csv
 from pyproj import Geod
 
-from tcpipe.cost.adaptation import ELSEWHERE_M, Adapted, Metres, Run, adapt, predict
+from tcpipe.cost.adaptation import Adapted, Metres, Run, adapt, predict
 from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
+from tcpipe.formats.geojson import make_line_feature
 from tcpipe.formats.json_files import write_json
-from tcpipe.formats.parquet import write_table
 from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.learning.models import Model
 from tcpipe.path import find_cuts
@@ -28,13 +28,15 @@ from tcpipe.planning.cost_model import (
     count_reasons,
     predict_segments,
 )
+from tcpipe.planning.frames import find_projection
 from tcpipe.planning.search import Turning, compute_turns, find_turning
+from tcpipe.splits.audit import PLACES, compute_middles
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.findings import LEFT_OUT
-from tcpipe.terrain.projection import Projection, compute_area, make_metres_from_plane
+from tcpipe.terrain.projection import compute_area, make_metres_from_plane
 from tcpipe.terrain.sampling import PatchFrames, compute_footprints, count_corners_on, make_patch_frames
-from tcpipe.terrain.tiles import MapReader, find_map_projection
+from tcpipe.terrain.tiles import MapReader
 
 Floats = NDArray[np.float64]
 
@@ -92,30 +94,6 @@ class PathCost:
     totals: PathTotals
     errors: Mapping[str, SumDistribution] | None
     """Of ``duration`` [s] and ``energy`` [J] in all; None without held-out samples."""
-
-
-def find_projection(source: MapReader) -> Projection:
-    """Return the operation from WGS 84 lon, lat [deg] to the map's CRS."""
-    return find_map_projection(source, "EPSG:4326")
-
-
-_FARTHEST_ORIGIN_M = 100_000.0
-"""From the map. A frame that begins further away has its longitude and latitude exchanged, or is of another site."""
-
-
-def find_origin_m(source: MapReader, origin_deg: tuple[float, float] | None) -> tuple[float, float]:
-    """Return a place in the plane of the map's CRS, (0, 0) without one; `UsageError` where it is not near the map."""
-    if origin_deg is None:
-        return 0.0, 0.0
-    x_m, y_m = find_projection(source).forward(np.array([origin_deg]))[0].tolist()
-    x_min, y_min, x_max, y_max = source.grid.bounds_m
-    off_m = np.hypot(x_m - np.clip(x_m, x_min, x_max), y_m - np.clip(y_m, y_min, y_max))
-    if not off_m <= _FARTHEST_ORIGIN_M:
-        raise UsageError(
-            f"--origin {origin_deg[0]:g},{origin_deg[1]:g}: is {off_m / 1000.0:.0f} km from map {source.name}, expected at most "
-            f"{_FARTHEST_ORIGIN_M / 1000.0:.0f}; give LON,LAT (longitude first) of the origin of the robot's map frame"
-        )
-    return x_m, y_m
 
 
 def compute_path_cost(
@@ -197,20 +175,24 @@ def _sum_costs(  # noqa: PLR0917
         name: Adapted(total, nothing, nothing, SumDistribution(0.0, 0.0, 0.0))
         for name, total in (("duration", duration), ("energy", energy))
     }
+    located = _locate_segments(source, segments)
     if known is not None and errors is None:
         raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
     if errors is not None:
-        begin_m, rise_m = ELSEWHERE_M + np.cumsum(segments.arc_m), segments.arc_m * np.tan(said.slope_rad)
+        begin_m, rise_m = np.cumsum(segments.arc_m), segments.arc_m * np.tan(said.slope_rad)
         for name, predicted in [(name, found[name]) for name in found if name in errors]:
             std = segments.arc_m * (said.duration_std_s if name == "duration" else said.energy_std_joule)
-            there = Metres(predicted.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std)
+            near = model.find_near(compute_middles([located[place] for place in PLACES]))
+            there = Metres(
+                predicted.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std, near
+            )
             found[name] = (
                 predict(errors[name], there) if known is None else adapt(errors[name], known.metres[name], there)
             )
     time, joule = found["duration"], found["energy"]
     table = PATH_SEGMENTS.table(
         path_segment=np.arange(len(class_id)),
-        **_locate_segments(source, segments),
+        **located,
         terrain_class=class_id,
         terrain_name=source.classes.names()[class_id].tolist(),
         slope_rad=said.slope_rad,
@@ -321,27 +303,26 @@ PATH_SEGMENTS = TableSchema(
     ),
 )  # fmt: skip
 
-ENDINGS = (".csv", ".parquet", ".json")
-
 
 def check_ending(path: Path) -> None:
-    """Raise `UsageError` unless a table can be written to a file of this name."""
-    if path.suffix.lower() not in ENDINGS:
-        raise UsageError(f"{path}: expected a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
-    if path.is_dir():
-        raise UsageError(f"{path}: is a directory, expected a file")
+    """Raise `UsageError` unless a table of path segments can be written to a file of this name."""
+    if path.suffix.lower() not in {".csv", ".geojson"} or path.is_dir():
+        raise UsageError(f"{path}: expected the name of a file that ends in .csv or .geojson")
 
 
 def write_path_segments(path: Path, table: pa.Table) -> None:
-    """Write the table in the format of the file's ending, whole or not at all."""
-    match path.suffix.lower():
-        case ".parquet":
-            write_table(table, path)
-        case ".json":
-            write_json(path, {"path_segments": table.to_pylist()})
-        case _:
-            with write_atomic_file(path) as temporary:
-                csv.write_csv(table, temporary)
+    """Write the table as CSV, or as GeoJSON of a line each, whole or not at all."""
+    if path.suffix.lower() == ".csv":
+        with write_atomic_file(path) as temporary:
+            csv.write_csv(table, temporary)
+        return
+    lines = [
+        make_line_feature(
+            np.array([[row[f"{end}_{axis}_deg"] for axis in ("lon", "lat")] for end in ("start", "end")]), row
+        )
+        for row in table.to_pylist()
+    ]
+    write_json(path, {"type": "FeatureCollection", "features": lines})
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_grid import make_survey
 from tcpipe.planning.cost_map import CARD, CostMapCard, make_cost_map_key, open_cost_map, read_cost_map_card
-from tcpipe.planning.cost_model import check_model
+from tcpipe.planning.cost_model import Reason, check_model
 from tcpipe.planning.path_cost import (
     PathTotals,
     check_ending,
@@ -36,8 +36,9 @@ from tcpipe.planning.path_cost import (
 from tcpipe.planning.path_options import PlanPathOptions
 from tcpipe.planning.plan import OBJECTIVES, Objective, Plan, PlanTotals, plan_paths
 from tcpipe.store import open_store
+from tcpipe.tables.bits import flag_name
 from tcpipe.tables.columns import to_integers
-from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding
+from tcpipe.tables.findings import LEFT_OUT, Finding, Severity, Subject, make_finding
 
 
 def choose_map(store: str | Path, name: str | None) -> MapFile:
@@ -123,7 +124,11 @@ def find_doubts(totals: PathTotals, path: Subject) -> Iterator[Finding]:
     """Yield where the model has no support on a path, and how little its intervals rest on."""
     for reason, count in totals.reasons.items():
         names, total = {"reason": reason.replace("_", " ")}, totals.path_segments
-        yield make_finding("path-not-supported", path, names=names, segment_count=count, total_count=total)
+        # turns have costs of their own
+        grade: Severity | None = "note" if reason == flag_name(Reason.CURVED) else None
+        yield make_finding(
+            "path-not-supported", path, severity=grade, names=names, segment_count=count, total_count=total
+        )
     if totals.duration_interval_s is None:
         yield make_finding("no-intervals", path)
     of_both = {

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 _ORIGIN = Option(
-    "Origin of the map frame of Nav2, as navsat_transform's datum (default: that of the map's CRS).",
+    "Origin of the map frame of Nav2, whose axes are true east and north (default: the plane of the map's CRS).",
     ("--origin",), "lonlat",
 )  # fmt: skip
 
@@ -33,7 +33,7 @@ class PredictPathOptions:
     _: KW_ONLY
     map_name: str | None = option(None, MAP)
     out: str | Path | None = option(
-        None, Option("Write the table of path segments: .csv, .parquet or .json.", (), "output_file", "FILE")
+        None, Option("Write the table of path segments: .csv or .geojson.", (), "output_file", "FILE")
     )
     physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)

@@ -24,7 +24,8 @@ from tcpipe.errors import ModelError, PathError
 from tcpipe.formats.json_files import convert_record
 from tcpipe.planning.cost_grid import BARRED, COURSES, LazyCostGrid, Mask
 from tcpipe.planning.cost_model import Reason
-from tcpipe.planning.path_cost import PathCost, PathTotals, compute_path_cost, describe_off_map, find_projection
+from tcpipe.planning.frames import find_projection
+from tcpipe.planning.path_cost import PathCost, PathTotals, compute_path_cost, describe_off_map
 from tcpipe.planning.search import (
     LeastCostPath,
     Steps,
@@ -266,27 +267,34 @@ class _Search:
     def find_finalists(
         self, objectives: Sequence[Objective], errors: dict[str, Errors] | None
     ) -> tuple[list[Floats], dict[Objective, int]]:
-        """Return the lines of paths that may be the best of any objective, (P, 2) each, and the steps taken as free by objective.
-
-        With the errors of predictions, also those of little risk.
-        """
-        bound_m, steps, paths = self._find_shortest()
-        lines, negative = list(self._draw_lines(steps, paths)), dict[Objective, int]()
-        class_id = self.survey.class_id() if set(objectives) - {"distance"} else None
-        for objective in objectives:
-            if objective != "distance" and class_id is not None:
-                steps, paths = self._find_best(objective, bound_m, class_id)
-                negative[objective] = paths[0].negative_steps
-                lines += self._draw_lines(steps, paths)
-        if class_id is not None:
-            for objective in OBJECTIVES[:2]:
-                quantity = "energy" if objective == "energy" else "duration"
-                cautions = _CAUTIONS if errors is not None and objective in objectives else ()
-                for caution in (*cautions, *((0.0,) if objective not in objectives else ())):
-                    of_all = None if errors is None else errors[quantity]
-                    lines += self._draw_lines(*self._find(objective, self.survey.predicted, class_id, of_all, caution))
+        """Return the lines of paths that may be the best of any objective, (P, 2) each, and the steps taken as free by objective."""
+        negative = dict[Objective, int]()
+        lines = list(self._iterate_finalists(objectives, errors, negative))
         different = {np.round(line, 3).tobytes(): line for line in lines}
         return list(different.values()), negative
+
+    def _iterate_finalists(
+        self, objectives: Sequence[Objective], errors: dict[str, Errors] | None, negative: dict[Objective, int]
+    ) -> Iterator[Floats]:
+        """Yield the shortest path; the best of each objective, for which the model is asked; then others over what is known by then.
+
+        Those are the best of objectives that were not asked for, and with ``errors`` those of little risk.
+        """
+        bound_m, steps, paths = self._find_shortest()
+        yield from self._draw_lines(steps, paths)
+        asked = [objective for objective in objectives if objective != "distance"]
+        class_id = self.survey.class_id() if asked else None
+        if class_id is None:
+            return
+        for objective in asked:
+            steps, paths = self._find_best(objective, bound_m, class_id)
+            negative[objective] = paths[0].negative_steps
+            yield from self._draw_lines(steps, paths)
+        for objective, quantity in (("energy", "energy"), ("time", "duration")):
+            cautions = (0.0,) if objective not in asked else () if errors is None else _CAUTIONS
+            for caution in cautions:
+                of_all = None if errors is None else errors[quantity]
+                yield from self._draw_lines(*self._find(objective, self.survey.predicted, class_id, of_all, caution))
 
     def _find_shortest(self) -> tuple[float, Steps, tuple[LeastCostPath, ...]]:
         """Return the length of the shortest path that can be driven, the steps and the path; only the ground is looked at."""

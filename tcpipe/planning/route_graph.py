@@ -20,7 +20,8 @@ from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import RouteEdge, RouteGraph, make_route_graph, read_route_graph
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_model import check_model
-from tcpipe.planning.path_cost import PathCost, compute_path_cost, find_origin_m, find_projection
+from tcpipe.planning.frames import Frame, find_projection, make_frame
+from tcpipe.planning.path_cost import PathCost, compute_path_cost
 from tcpipe.store import Store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import Subject, make_finding
@@ -96,7 +97,7 @@ def write_route_graph(
     ----------
     model, source : who predicts, and the map.
     graph, store : the graph's file, or without one the store whose runs propose one.
-    origin_deg : longitude and latitude where the graph's frame has x = y = 0, its axes those of the map's CRS; the CRS's own without.
+    origin_deg : longitude and latitude of the origin of the graph's frame, true east and north; without one that of the map's CRS.
     two_way : whether an edge is added for each that has none back.
 
     Raises `PathError`, `ModelError` or `MapError` where the graph, the model or the map cannot be used; `UsageError` or `StoreError` where
@@ -107,15 +108,14 @@ def write_route_graph(
     if graph is not None and out.resolve() == graph.resolve():
         raise UsageError(f"{out}: is the graph itself; give the output another name")
     check_model(model, source)
-    origin_m = np.array(find_origin_m(source, origin_deg))
-    found = propose_graph(source, store, origin_m) if graph is None else read_route_graph(graph)
+    frame = make_frame(source, origin_deg)
+    found = propose_graph(source, store, frame) if graph is None else read_route_graph(graph)
     where = str(graph or "the proposed graph")
     edges = (*found.edges, *(found.list_missing_reverses() if two_way else ()))
     done, without_cost = list[tuple[RouteEdge, Mapping[str, Json]]](), list[int]()
     unreliable = gaining = 0
     for edge in edges:
-        ends_m = np.array([found.nodes[edge.start], found.nodes[edge.end]]) + origin_m
-        lonlat, cost = find_projection(source).inverse(ends_m), None
+        lonlat, cost = frame.to_lonlat(np.array([found.nodes[edge.start], found.nodes[edge.end]])), None
         with suppress(PathError):  # off the map, or from a place to the same
             cost = compute_path_cost(
                 model, source, lonlat, where=f"{where}: edge {edge.edge_id}", shortest_m=_SHORTEST_M
@@ -149,7 +149,7 @@ def _list_numbers(cost: PathCost) -> dict[str, Json]:
     return numbers
 
 
-def propose_graph(source: MapFile, store: Store, origin_m: Floats) -> RouteGraph:
+def propose_graph(source: MapFile, store: Store, frame: Frame) -> RouteGraph:
     """Return a graph of what the runs of a store drove on a map: nodes where ways meet, end or bend, edges in both directions."""
     x_min, y_min, x_max, y_max = source.grid.bounds_m
     lines = list[Floats]()
@@ -166,7 +166,7 @@ def propose_graph(source: MapFile, store: Store, origin_m: Floats) -> RouteGraph
     if not lines:
         raise UsageError(f"{store.root}: no run with segments on map {source.name}; give a graph with --graph")
     xy_m, pairs = connect_lines(lines)
-    return make_route_graph(xy_m - origin_m, pairs)
+    return make_route_graph(frame.from_plane(xy_m), pairs)
 
 
 def connect_lines(lines: Sequence[Floats]) -> tuple[Floats, list[tuple[int, int]]]:

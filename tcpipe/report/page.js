@@ -147,30 +147,6 @@ const page = (() => {
     fillSelect(select, layers.map((layer) => layer.name));
     if (layers.some((layer) => layer.name === "ortho")) select.value = "ortho";
   }
-  // Patches as buttons (gallery.html): `of(row)` gives a row's class, split and words, `choose(row)` is what a click does.
-  function gallery(sheets, of, choose) {
-    let most = 60;
-    const rows = sheets.rows.map(of);
-    fillSelect(at("gallery-class"), [...new Set(rows.map((one) => one.kind))].sort());
-    fillSelect(at("gallery-split"), [...new Set(rows.map((one) => one.split))].sort());
-    fillLayers(at("gallery-layer"), sheets.layers);
-    const draw = () => {
-      const [kind, split] = [at("gallery-class").value, at("gallery-split").value];
-      const layer = sheets.layers.find((one) => one.name === at("gallery-layer").value);
-      const cells = [...rows.keys()].filter((i) => (!kind || rows[i].kind === kind) && (!split || rows[i].split === split));
-      at("gallery").replaceChildren(...cells.slice(0, most).map((i) => {
-        const button = make("button", "", { type: "button" });
-        button.append(patch(sheets, layer, i, 92), rows[i].words);
-        button.onclick = () => { choose(sheets.rows[i]); at("chosen").scrollIntoView({ block: "nearest" }); };
-        return button;
-      }));
-      at("gallery-count").textContent = `${Math.min(cells.length, most)} of ${cells.length} patches`;
-      at("gallery-more").hidden = cells.length <= most;
-    };
-    for (const id of ["gallery-class", "gallery-split", "gallery-layer"]) at(id).onchange = draw;
-    at("gallery-more").onclick = () => { most += 120; draw(); };
-    draw();
-  }
   // What is chosen, below a short summary or the first row of figures, and buttons that go through `count()` rows from row `current(by)`.
   function stepThrough(count, current, choose) {
     const summary = document.querySelector(".summary"), room = make("div", "", { className: "selection" });
@@ -182,15 +158,6 @@ const page = (() => {
     at("before").onclick = () => step(-1);
     at("after").onclick = () => step(1);
     at("row").onchange = () => { const i = at("row").valueAsNumber - 1; if (i >= 0 && i < count()) choose(i); };
-  }
-  // Points of a source that are chosen by a click (on plots by name, with their axes), a box or these buttons; `show(rows)` says what they are.
-  function chooseSamples(source, axes, count, show) {
-    const choose = (rows) => { source.selected.indices = rows; };
-    source.selected.change.connect(() => show(source.selected.indices));
-    for (const [name, of] of Object.entries(axes)) clickNearest(name, source, of, () => true, (i) => choose([i]));
-    stepThrough(count, (by) => source.selected.indices[0] ?? (by > 0 ? -1 : 0), (i) => choose([i]));
-    at("clear").onclick = () => choose([]);
-    return choose;
   }
   // A click on a plot takes the nearest point that is `allowed`, at most 30 pixels away: `choose(row, whether shift is pressed)`.
   function clickNearest(name, source, [x, y], allowed, choose) {
@@ -232,7 +199,7 @@ const page = (() => {
     }));
   }
   return {
-    at, copy, fixed, make, fillLayers, fillSelect, pairs, patch, patches, legend, ramp, ends, scale, clock, explain, chooseGround, chooseSamples, clickNearest, gallery, mean, quantity, stepThrough, unpack,
+    at, copy, fixed, make, fillLayers, fillSelect, pairs, patch, patches, legend, ramp, ends, scale, clock, explain, chooseGround, clickNearest, mean, quantity, stepThrough, unpack,
     data: read("page-data"),
     // What a page's own script does when the figures that it asks for are drawn; what it returns is called with the view of each that follows.
     start: (of) => { work = of; },

@@ -192,12 +192,6 @@ def make_paper_surface() -> Surface:
     return Surface(looks, **waves, map_noise_std_m=states["map_noise_std_m"], swing=states["swing"])
 
 
-def scale_hidden_variance(world: World, factor: float) -> World:
-    """Return a world in which what nothing shows has ``factor`` times its variance."""
-    hidden = tuple(replace(wave, amplitude=float(np.sqrt(factor)) * wave.amplitude) for wave in world.resistance)
-    return replace(world, resistance=hidden)
-
-
 def _iterate_tours(drives: Numbers) -> Iterator[Wander | AlongRoad]:
     """Yield the drives: to and fro along roads, and random tours of grass and mud that stay in one of the areas."""
     for run in drives["road"]:

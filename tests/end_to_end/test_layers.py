@@ -344,9 +344,7 @@ def test_ground_unlike_that_of_training_in_a_layer_of_one_s_own_is_named(models)
 
 
 def test_an_evaluation_takes_the_layers_of_the_model(models, tmp_path):
-    result = CliRunner().invoke(
-        cli, ["evaluate", *map(str, (models / "model-bands", models / "zarr", tmp_path / "e")), "--no-baselines"]
-    )
+    result = CliRunner().invoke(cli, ["evaluate", *map(str, (models / "model-bands", models / "zarr", tmp_path / "e"))])
     assert result.exit_code in {0, 3}, result.output
     found = json.loads((tmp_path / "e" / "evaluation.json").read_text())
     assert found

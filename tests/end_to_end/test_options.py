@@ -65,7 +65,7 @@ def test_a_map_a_store_and_a_cell_are_what_planning_takes(place: Path) -> None:
     where = ("--map", "site", "--store", "store")
     costs = ("cost-map", "physics", "costs", *where, "--cell-size", "4", "--origin", "15.4335,47.0701")
     assert answer(*costs, cwd=place)["status"] == "done"
-    again = answer("evaluate", "physics", "dataset", "evaluated", "--seed", "3", "--no-baselines", cwd=place)
+    again = answer("evaluate", "physics", "dataset", "evaluated", "--seed", "3", cwd=place)
     assert again["config"]["seed"] == 3
 
 

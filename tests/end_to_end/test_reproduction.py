@@ -14,6 +14,13 @@ pytest.importorskip("torch")
 
 ENV = {"OMP_NUM_THREADS": "1"}
 
+OWN = """
+import numpy as np
+
+def predict(patches, features):
+    return np.column_stack([150.0 + 300.0 * features.slope_rad, np.full(len(patches), 0.8)])
+"""
+
 
 @pytest.fixture(scope="module")
 def reproduced(tmp_path_factory):
@@ -37,15 +44,37 @@ def test_every_claim_is_printed_as_it_stands(reproduced):
 
 def test_table_four_is_of_the_same_samples(reproduced):
     here, _ = reproduced
-    energy = json.loads((here / "here" / "seed-0" / "evaluation" / "evaluation.json").read_text())["energy"]
+    where = here / "here" / "dataset" / "resnet18-0" / "networks" / "networks.json"
+    results = json.loads(where.read_text())["results"]
+    assert len({row["baseline"] for row in results}) == 3
     for split in ("test", "unseen"):
-        assert len({by_split[split]["count"] for by_split in energy.values()}) == 1
-    assert len(energy) == 4
+        assert len({row["errors"]["count"] for row in results if row["split"] == split}) == 1
+
+
+def test_the_benchmark_has_every_kind_and_resumes(reproduced):
+    here, _ = reproduced
+    rows = json.loads((here / "here" / "benchmark.json").read_text())["rows"]
+    assert {row["kind"] for row in rows} == {"linear", "physics", "boosting", "resnet18"}
+    of_all = [row for row in rows if row["terrain"] == "all" and row["quantity"] == "E"]
+    assert all(row["rmse"]["value"] > 0.0 and 0.0 < row["largest_r2"] < 1.0 for row in of_all)
+    (here / "here" / "own.py").write_text(OWN)
+    command = ("benchmark", "dataset", "--kinds", "linear", "--seeds", "1", "--predictor", "own.py", "--out", "tables")
+    assert "linear" in tcpipe(*command, cwd=here / "here", env=ENV).stdout
+    said = json.loads(tcpipe(*command, "--json", "--quiet", cwd=here / "here", env=ENV).stdout)
+    assert {row["kind"] for row in said["rows"]} == {"linear", "own"}
+    whole = next(row for row in of_all if row["kind"] == "linear" and row["split"] == "test")
+    again = json.loads((here / "here" / "tables" / "benchmark.json").read_text())["rows"]
+    same = next(
+        row
+        for row in again
+        if row["kind"] == "linear" and (row["terrain"], row["quantity"], row["split"]) == ("all", "E", "test")
+    )
+    assert same["rmse"] == whole["rmse"]
 
 
 def test_every_page_says_that_the_data_are_simulated(reproduced):
     here, _ = reproduced
-    for page in ("reproduction.html", "seed-0/evaluation/evaluation.html"):
+    for page in ("reproduction.html", "dataset/resnet18-0/evaluation/evaluation.html"):
         assert "The data are simulated" in (here / "here" / page).read_text()
     page = (here / "here" / "reproduction.html").read_text()
     assert "the small site" in page
@@ -53,7 +82,7 @@ def test_every_page_says_that_the_data_are_simulated(reproduced):
 
 def test_even_a_quick_network_learns_that_slope_costs_time(reproduced):
     here, _ = reproduced
-    values = json.loads((here / "here" / "seed-0" / "evaluation" / "evaluation.json").read_text())
+    values = json.loads((here / "here" / "dataset" / "resnet18-0" / "evaluation" / "evaluation.json").read_text())
     for split in ("test", "unseen"):
         ours, expected = (values["time"][who][split]["mape_percent"] for who in ("ours", "expected time"))
         assert ours < expected
@@ -89,9 +118,7 @@ def test_train_and_evaluate_by_hand(reproduced):
     trained = tcpipe("train", "here/dataset", "model", "--width", "16", "--epochs", "1", cwd=here, env=ENV)
     assert trained.returncode == 0, trained.stderr
     assert "% of it feeding" in trained.stdout
-    done = tcpipe(
-        "evaluate", "model", "here/dataset", "--no-baselines", "--noise-draws", "1", "--json", cwd=here, env=ENV
-    )
+    done = tcpipe("evaluate", "model", "here/dataset", "--noise-draws", "1", "--json", cwd=here, env=ENV)
     assert set(json.loads(done.stdout)["splits"]) == {"test", "unseen"}
     page = (here / "evaluation" / "evaluation.html").read_text()
     assert "The data are simulated" not in page  # a dataset does not say so of itself
@@ -123,11 +150,6 @@ def test_bad_input_is_one_plain_line(reproduced):
     assert "there is no such directory" in plain_lines(tcpipe("train", "nowhere", cwd=here, env=ENV), 2)
     nowhere = tcpipe("evaluate", "nowhere", "here/dataset", cwd=here, env=ENV)
     assert "there is no such directory" in plain_lines(nowhere, 2)
-    networks = here / "here" / "seed-0" / "evaluation" / "networks"
-    baseline = next(networks.glob("wei_isler_*"))
-    assert "it predicts only energy_joule" in plain_lines(
-        tcpipe("evaluate", baseline, "here/dataset", "of-energy", cwd=here, env=ENV), 1
-    )
     (here / "mine").mkdir()
     (here / "mine" / "thesis.txt").write_text("important")
     assert "is no reproduction" in plain_lines(tcpipe("reproduce", "mine", "--quick", cwd=here, env=ENV), 2)

@@ -1,6 +1,6 @@
 """Maps that Nav2's map_server loads: a grey picture (.pgm) and what it means (.yaml), mode ``scale``.
 
-In that mode grey falls from white (cost 0) in even steps to almost black (99). Black alone is above ``occupied_thresh``: lethal to every
+In that mode grey falls from white (cost 0) in even steps to almost black (98). Black alone is above ``occupied_thresh``: lethal to every
 reader, also to those that end the scale at 99. A .pgm has no alpha, so unknown would look like lethal: what is not known is lethal.
 
 The style (QML) in which QGIS shows a band of a cost map.
@@ -27,20 +27,18 @@ from tcpipe.terrain.target_grid import MapGrid
 LETHAL = 100
 """Cost of what is never crossed."""
 
-HIGHEST = 99
-"""Largest cost of what can be crossed."""
+HIGHEST = 98
+"""Largest cost of what can be crossed: current static layers take 99 for inscribed, which is an obstacle."""
 
 _OCCUPIED = 0.995
 """Between the darkest grey of `HIGHEST` and black."""
 
 
-def write_nav2_map(
-    path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, origin_m: tuple[float, float], meaning: str
-) -> None:
+def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, frame: str, meaning: str) -> None:
     """Write ``path`` (.yaml) and the picture of the same name beside it.
 
-    ``cost`` is from 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first; ``grid`` places the cells in the frame, whose zero is at
-    ``origin_m`` in the grid's CRS; ``meaning`` is one line that says what a cost is.
+    ``cost`` is from 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first; ``grid`` places the cells in the frame; ``frame`` and
+    ``meaning`` are lines that say what x and y, and what a cost is.
     """
     grey = np.where(cost == LETHAL, 0.0, np.rint(255.0 * (1.0 - _OCCUPIED * cost / 100.0))).astype(np.uint8)
     picture = path.with_suffix(".pgm")
@@ -49,11 +47,11 @@ def write_nav2_map(
     x_min, y_min, _, _ = grid.bounds_m
     lines = (
         f"# {meaning}",
-        f"# frame: x and y of {grid.crs if len(grid.crs) < 40 else 'the map CRS'} [m] less {origin_m[0]!r}, {origin_m[1]!r}",
+        f"# frame: {frame}",
         f"image: {picture.name}",
         "mode: scale",
         f"resolution: {grid.pixel_size_m!r}",
-        f"origin: [{x_min - origin_m[0]!r}, {y_min - origin_m[1]!r}, 0.0]",
+        f"origin: [{x_min!r}, {y_min!r}, 0.0]",
         "negate: 0",
         f"occupied_thresh: {_OCCUPIED}",
         "free_thresh: 0.0",

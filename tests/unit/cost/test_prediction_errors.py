@@ -5,6 +5,7 @@ import pytest
 from physics_model import made_residuals
 
 from tcpipe.cost.prediction_errors import (
+    NEAR,
     estimate_correlation,
     fit_bias_correction,
     fit_errors,
@@ -249,4 +250,24 @@ def test_errors_of_one_fold_are_wider_by_what_folds_differ():
     one, two = (fit_errors({**residuals, "fold": fold})["energy"] for fold in (np.zeros(4000), np.arange(4000) % 2))
     assert one.compute_std(np.full(1, 150.0), np.full(1, _GRASS)) == pytest.approx(
         1.225 * two.compute_std(np.full(1, 150.0), np.full(1, _GRASS)), rel=1e-3
+    )
+
+
+def test_metres_near_training_ground_have_errors_of_their_own():
+    """Predictions by other runs of ground that these drove err by a third; a path has the errors of its own metres."""
+    residuals, rng = made_residuals(4000, sigma=0.15), np.random.default_rng(3)
+    near = np.where(np.arange(4000) % 2, np.nan, residuals["power_watt"] / (1.0 + 0.05 * rng.normal(size=4000)))
+    residuals |= dict(zip(NEAR, (near, np.where(np.isnan(near), np.nan, 0.8)), strict=True))
+    errors, said, ground = fit_errors(residuals)["energy"], np.full(40, 187.5), np.full(40, _GRASS)
+    widths = {}
+    for share in (0, 20, 40):
+        is_near = np.arange(40) < share
+        low, high = errors.compute_sum(said, ground, None, is_near).interval
+        widths[share] = high - low
+        std = errors.compute_std(said, ground, None, is_near)
+        np.testing.assert_allclose(std, 187.5 * np.where(is_near, 0.05, 0.15), rtol=0.05)
+    assert widths[40] == pytest.approx(widths[0] / 3.0, rel=0.15)
+    assert widths[40] < widths[20] < widths[0]
+    assert (
+        errors.compute_sum(said, ground).interval == errors.compute_sum(said, ground, None, np.zeros(40, bool)).interval
     )

@@ -2,26 +2,21 @@
 
 import numpy as np
 import pytest
-from made_models import made_comparison, made_evaluation
+from made_models import made_comparison
 
+from tcpipe.experiment.networks import HEIGHTS
 from tcpipe.experiment.simulation_floor import CLAIMS, FEWEST_SEEDS, check_claims
-from tcpipe.learning.baselines import ALL_LAYERS_PER_CLASS, PER_CLASS
-from tcpipe.learning.evaluation_facts import SplitErrors
 from tcpipe.learning.metrics import Ratio
 
 SURE = Ratio(0.8, 0.7, 0.9)
 
 
 def _run(**ratios):
-    rows = [
+    return [
         made_comparison(name, ratios.get(name, SURE) if quantity == "E" else Ratio(9.0, 8.0, 10.0), quantity=quantity)
         for name in CLAIMS
         for quantity in ("w", "E")
     ]
-    networks = tuple(row for row in rows if row.baseline in {PER_CLASS, ALL_LAYERS_PER_CLASS})
-    baselines = tuple(row for row in rows if row.baseline not in {PER_CLASS, ALL_LAYERS_PER_CLASS})
-    splits = {"unseen": SplitErrors(10, {}, (), {}, {}, {}, {})}
-    return made_evaluation(splits=splits, networks=networks, baselines=baselines)
 
 
 def _verdicts(runs):
@@ -64,11 +59,11 @@ def test_the_papers_own_ratio():
 
 def _spread(*values):
     """Trainings with these ratios, each with an interval of ± 2 % that alone would hold the claim."""
-    return [_run(**{PER_CLASS: Ratio(value, value / 1.02, value * 1.02)}) for value in values]
+    return [_run(**{HEIGHTS: Ratio(value, value / 1.02, value * 1.02)}) for value in values]
 
 
 def _claim(runs):
-    return next(claim for claim in check_claims(runs) if claim.says == CLAIMS[PER_CLASS])
+    return next(claim for claim in check_claims(runs) if claim.says == CLAIMS[HEIGHTS])
 
 
 def test_trainings_that_differ_leave_a_claim_open():
@@ -88,12 +83,12 @@ def test_trainings_that_differ_leave_a_claim_open():
 
 def test_equal_trainings_leave_the_interval_of_their_samples():
     """The samples are the same for all: more trainings do not make them more."""
-    claim = _claim(_runs(**{PER_CLASS: Ratio(0.9, 0.8, 0.9**2 / 0.8)}))
+    claim = _claim(_runs(**{HEIGHTS: Ratio(0.9, 0.8, 0.9**2 / 0.8)}))
     assert (claim.ratio.low, claim.ratio.high) == pytest.approx((0.8, 0.9**2 / 0.8), rel=1e-3)
 
 
 def test_what_was_not_measured_in_one_training_is_not_measured():
-    claim = _claim([_run(), _run(**{PER_CLASS: Ratio(None, None, None)})])
+    claim = _claim([_run(), _run(**{HEIGHTS: Ratio(None, None, None)})])
     assert str(claim) == (
         "not measured: one net beats a net per class, heights alone, unseen: RMSE of E – of its (0.81 in the paper); one training"
     )

@@ -9,7 +9,7 @@ from synthetic_store import add_run, box, lanes, lonlat, open_world, region_file
 
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError
-from tcpipe.learning.evaluation_facts import EvaluateConfig
+from tcpipe.learning.evaluation import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import load_model
@@ -19,7 +19,7 @@ from tcpipe.recipe import Recipe
 
 pytest.importorskip("lightgbm")
 
-CONFIG = EvaluateConfig(noise_draws=1, baselines=False)
+CONFIG = EvaluateConfig(noise_draws=1)
 real_column, real_labels = Split.column, Split.labels.func
 
 

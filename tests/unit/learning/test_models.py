@@ -72,8 +72,8 @@ def test_no_model_and_half_a_model(tmp_path, place):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"schema_version": 2}, "written by model schema 2, expected 4; train the model again"),
-        ({"schema_version": 99}, "written by model schema 99, expected 4; train the model again"),
+        ({"schema_version": 2}, "written by model schema 2, expected 5; train the model again"),
+        ({"schema_version": 99}, "written by model schema 99, expected 5; train the model again"),
         ({"kind": "tcpipe dataset"}, "not the card of a tcpipe model"),
         (
             {"inputs": None},

@@ -7,7 +7,7 @@ import pytest
 
 from tcpipe.errors import ModelError, StoreError
 from tcpipe.learning.fitting import compute_loss_factors, mean_loss
-from tcpipe.learning.network_model import check_trainable
+from tcpipe.learning.network_model import TrainingProgress, _State, check_trainable
 
 torch = pytest.importorskip("torch")
 
@@ -62,16 +62,17 @@ def test_a_state_for_which_there_is_no_room_is_one_error_that_names_it(tmp_path,
     from tcpipe.learning.network import Trainer, make_resnet18
 
     trainer = Trainer(make_resnet18(1, 1, 16, seed=0, start=[0.5]), np.ones(1, np.float32))
+    state = _State(trainer, TrainingProgress(), trainer.copy_weights(), np.array([0.5]))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
         with pytest.raises(StoreError, match=r"checkpoint: cannot be written \(File too large\)"):
-            trainer.write_state(tmp_path / "checkpoint", {"epoch": 1})
+            state.keep(tmp_path / "checkpoint")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
-    trainer.write_state(tmp_path / "checkpoint", {"epoch": 1})
-    assert trainer.read_state(tmp_path / "checkpoint") == {"epoch": 1}
+    state.keep(tmp_path / "checkpoint")
+    assert trainer.read_state(tmp_path / "checkpoint")["held_out"] == [0.5]
 
 
 @pytest.mark.parametrize("width", [4, 8, 24])

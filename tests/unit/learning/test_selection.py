@@ -9,7 +9,7 @@ from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import load_model
 from tcpipe.learning.physics_model import fit_curves
-from tcpipe.learning.training import Variant, choose_kind, is_within_error, train
+from tcpipe.learning.training import choose_kind, is_within_error, train
 
 real_labels = Split.labels.func
 
@@ -18,10 +18,6 @@ def noise(split):
     """Of each sample the same, whatever split it is in."""
     seeds = split.column("start_ns").astype(np.int64) % 1_000_003
     return np.array([np.random.default_rng(seed).normal(size=2) for seed in seeds])
-
-
-def everywhere(split):
-    return np.tile([100.0, 0.9], (len(split), 1))
 
 
 def by_class(split):
@@ -50,16 +46,15 @@ def labelled(monkeypatch):
     return replace_labels
 
 
-@pytest.mark.parametrize(("form", "kind"), [(everywhere, "mean"), (by_slope, "linear")])
-def test_what_follows_a_simple_rule_gets_the_simple_kind(dataset, labelled, form, kind):
-    labelled(form)
-    assert choose_kind(open_dataset(dataset), FitConfig(model="auto"), Variant()) == kind
+def test_what_follows_a_simple_rule_gets_the_simple_kind(dataset, labelled):
+    labelled(by_slope)
+    assert choose_kind(open_dataset(dataset), FitConfig(model="auto")) == "linear"
 
 
 def test_what_only_the_patch_shows_gets_trees(dataset, labelled):
     pytest.importorskip("lightgbm")
     labelled(by_picture)
-    assert choose_kind(open_dataset(dataset), FitConfig(model="auto"), Variant()) == "boosting"
+    assert choose_kind(open_dataset(dataset), FitConfig(model="auto")) == "boosting"
 
 
 def test_one_standard_error_is_of_the_clusters():
@@ -78,18 +73,17 @@ def test_the_command_says_what_it_compared_and_chooses_once(dataset, tmp_path):
     card = load_model(tmp_path / "model").card
     assert card.training.config.model == "auto"
     assert f"chooses {card.training.kind}, the simplest within one standard error of the best (" in done.stderr
-    assert "predicted by other runs: mean" in done.stderr
+    assert "predicted by other runs: linear" in done.stderr
     again = tcpipe("train", dataset, "model", cwd=tmp_path)
     assert "nothing to do" in again.stdout
     assert "chooses" not in again.stderr
 
 
-@pytest.mark.parametrize("kind", ["mean", "linear", "spline"])
-def test_curves_are_models_like_the_others(dataset, tmp_path, kind):
-    train(dataset, tmp_path / "model", config=FitConfig(model=kind))
+def test_curves_are_models_like_the_others(dataset, tmp_path):
+    train(dataset, tmp_path / "model", config=FitConfig(model="linear"))
     model, data = load_model(tmp_path / "model"), open_dataset(dataset)
     split, features = data["train"], read_extra_features(data["train"])
-    curves = fit_curves(kind, features.slope_rad, features.class_id, split.labels.astype(np.float64))
+    curves = fit_curves("linear", features.slope_rad, features.class_id, split.labels.astype(np.float64))
     there = read_extra_features(data["unseen"])
     said = model.predict(data["unseen"].with_channels("height").patches, there).mean
     assert said == pytest.approx(curves.predict(there.slope_rad, there.class_id), rel=1e-6)

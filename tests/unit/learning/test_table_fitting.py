@@ -1,6 +1,7 @@
 """A table is a model folder like any other: trained in a moment, asked, evaluated, replaced."""
 
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,12 +10,9 @@ import pytest
 from installed_command import tcpipe
 
 from tcpipe.dataset import open_dataset
-from tcpipe.errors import DatasetError
-from tcpipe.learning.evaluation import evaluate
-from tcpipe.learning.evaluation_facts import EvaluateConfig
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import HISTORY, README, WEIGHTS, load_model
-from tcpipe.learning.training import Variant, train
+from tcpipe.learning.training import train
 from tcpipe.pipeline.verify import verify
 from tcpipe.planning.cost_model import predict_patches
 
@@ -59,14 +57,10 @@ def test_the_same_again_is_nothing_to_do_and_the_same_bytes(trained, dataset, tm
         assert (tmp_path / "model" / name).read_bytes() == (trained[0] / name).read_bytes()
 
 
-def test_one_layer_one_output_and_weights(dataset, tmp_path):
-    train(dataset, tmp_path / "height", config=CONFIG, variant=Variant(channels=("height",), energy_only=True))
-    model = load_model(tmp_path / "height")
-    said = model.predict(open_dataset(dataset)["train"].with_channels("height").patches).mean
-    assert said.shape[1] == 1
+def test_one_layer_and_weights(dataset, tmp_path):
+    train(dataset, tmp_path / "height", config=replace(CONFIG, layers=("height",)))
+    assert load_model(tmp_path / "height").card.inputs.channels == ("height",)
     train(dataset, tmp_path / "weighed", config=replace(CONFIG, inverse_variance_weights=True))
-    with pytest.raises(DatasetError, match="no labelled samples in split train"):
-        train(dataset, tmp_path / "none", config=CONFIG, variant=Variant(classes=(1,)))
 
 
 def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):
@@ -82,12 +76,6 @@ def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):
     assert said.mean[asked, 0] == pytest.approx(model.predict(split.patches[:20]).mean[asked, 0])
 
 
-def test_it_is_evaluated_without_networks(trained, dataset, tmp_path):
-    found, _ = evaluate(trained[0], dataset, tmp_path / "evaluation", EvaluateConfig(noise_draws=1), key="key")
-    assert list(found.energy) == ["ours"]
-    assert not (tmp_path / "evaluation").exists()
-
-
 def test_settings_of_the_recipe_rule_the_trees_and_options_of_the_command_the_network(dataset, tmp_path):
     (tmp_path / "own.toml").write_text("[train]\ntrees = 3\ntree_leaves = 2\nepochs = 7\n")
     done = tcpipe(
@@ -95,10 +83,10 @@ def test_settings_of_the_recipe_rule_the_trees_and_options_of_the_command_the_ne
     )
     assert done.returncode == 0
     model = load_model(tmp_path / "model")
-    config, forest = model.card.training.config, model.predictor.table.forest
+    config, texts = model.card.training.config, model.predictor.table.trees
     assert (config.trees, config.tree_leaves, config.epochs) == (3, 2, 9)
-    assert 1 <= np.bincount(forest.output).max() <= 3
-    assert forest.depth.max() == 1
+    assert all(1 <= text.count("Tree=") <= 3 for text in texts)
+    assert {leaves for text in texts for leaves in re.findall(r"num_leaves=(\d+)", text)} == {"2"}
     (tmp_path / "own.toml").write_text("[train]\ntrees = 0\n")
     done = tcpipe("train", dataset, "other", "--recipe", "own.toml", cwd=tmp_path)
     assert "own.toml: train.trees is 0; expected a whole number from 1 to 10000" in done.stderr

@@ -1,4 +1,6 @@
-"""Curves and trees together: what trees alone cannot say, and what the curves leave to them."""
+"""Curves and trees together: the features of patches, LightGBM's text, and texts that are none."""
+
+import re
 
 import numpy as np
 import pytest
@@ -67,34 +69,50 @@ def _drawn(count, seed=0):
     return features, labels + rng.normal(size=labels.shape) * [5.0, 0.02], rng.integers(0, 5, count)
 
 
-def test_trees_by_hand():
-    """Two trees of the first output, a stump and one leaf; of the second a tree of two steps."""
-    made = forest.Forest(
-        feature=np.array([1, 0, 0, 0, 0, 0, 1, 0, 0], np.uint32),
-        threshold=np.array([0.5, 0.0, 0.0, 0.0, 2.0, 0.0, -1.0, 0.0, 0.0]),
-        child=np.array([[1, 2], [1, 1], [2, 2], [3, 3], [5, 6], [5, 5], [7, 8], [7, 7], [8, 8]], np.uint32),
-        value=np.array([0.0, 1.0, 2.0, 10.0, 0.0, 3.0, 0.0, 4.0, 5.0]),
-        root=np.array([0, 3, 4], np.uint32),
-        depth=np.array([1, 0, 2], np.uint32),
-        output=np.array([0, 0, 1], np.uint32),
-    )
-    features = np.array([[0.0, 0.5], [3.0, 0.6], [3.0, -1.0], [2.0, 0.0]])
-    assert made.predict(features).tolist() == [[11.0, 3.0], [12.0, 5.0], [11.0, 4.0], [11.0, 3.0]]
-    assert made.predict(np.tile(features, (200, 1)))[796:].tolist() == made.predict(features).tolist()
-    assert forest.read_forest(made.arrays()).predict(features[:1]).tolist() == [[11.0, 3.0]]
+def _make_trees(count=600):
+    features, labels, folds = _drawn(count)
+    return features, labels, folds, *forest.grow(features, labels, np.ones_like(labels), folds)
 
 
-def test_they_say_what_lightgbm_says():
+def test_they_predict_as_lightgbm_and_are_its_own_text():
     lightgbm = pytest.importorskip("lightgbm")
-    features, labels, folds = _drawn(600)
-    made, held_out = forest.grow(features, labels, np.ones_like(labels), folds)
-    for number, label in enumerate(labels.T):
-        rounds = int((made.output == number).sum())
-        booster = lightgbm.train(RULES, lightgbm.Dataset(features, label), rounds)
-        assert made.predict(features)[:, number] == pytest.approx(booster.predict(features), rel=1e-12)
+    features, labels, folds, trees, held_out, largest = _make_trees()
+    for number, (label, text) in enumerate(zip(labels.T, trees, strict=True)):
+        booster = lightgbm.Booster(model_str=text)
+        whole = lightgbm.train(RULES, lightgbm.Dataset(features, label), booster.num_trees())
+        assert booster.predict(features) == pytest.approx(whole.predict(features), rel=1e-12)
+        assert booster.num_trees() <= largest
+        assert forest.clean_trees(text, 4) == text, number
     assert np.std(held_out - labels, axis=0) == pytest.approx([5.0, 0.02], rel=0.25)
-    again, _ = forest.grow(features, labels, np.ones_like(labels), folds)
-    assert all(np.array_equal(array, again.arrays()[name]) for name, array in made.arrays().items())
+    assert forest.grow(features, labels, np.ones_like(labels), folds)[0] == trees
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("split_feature", "4", "invalid nodes"),
+        ("left_child", "900", "invalid nodes"),
+        ("left_child", "0", "invalid nodes"),  # of the first node: a cycle
+        ("right_child", "-900", "invalid nodes"),
+        ("threshold", "nan", "not finite"),
+        ("leaf_value", "inf", "not finite"),
+        ("leaf_value", "1 2", "invalid nodes"),
+        ("num_leaves", "19", "invalid nodes"),
+        ("num_cat", "1", "no training makes"),
+        ("is_linear", "1", "no training makes"),
+        ("split_feature", "99999999999999999999", "cannot be read"),
+    ],
+)
+def test_a_text_by_which_the_reader_would_leave_its_memory_is_refused(name, value, words):
+    pytest.importorskip("lightgbm")
+    text = _make_trees(200)[3][0]
+    broken = re.sub(rf"(?m)^{name}=\S+", f"{name}={value}", text, count=1)
+    assert broken != text
+    with pytest.raises(ModelError, match=words):
+        forest.clean_trees(broken, 4)
+    for part in ("", text[:300], text.replace("Tree=0", "Tree=0\nTree=0")):
+        with pytest.raises(ModelError, match="no training makes"):
+            forest.clean_trees(part, 4)
 
 
 def test_without_lightgbm_there_is_one_line(monkeypatch):
@@ -126,7 +144,7 @@ def fitted():
 
 
 def test_steeper_ground_than_any_goes_on_straight_and_texture_is_heeded(fitted):
-    model, _ = fitted
+    model, *_ = fitted
     features, labels, _ = ground(300, steepest=0.4, seed=1)
     said = model.predict(features)
     assert np.abs(said[:, 0] - labels[:, 0]).mean() < 4.0
@@ -135,7 +153,7 @@ def test_steeper_ground_than_any_goes_on_straight_and_texture_is_heeded(fitted):
 
 def test_what_the_other_folds_said_is_no_better_than_what_is_new(fitted):
     """Residuals of a fit that saw its samples would promise too much."""
-    model, held_out = fitted
+    model, held_out, _ = fitted
     features, labels, _ = ground()
     new, told, _ = ground(seed=2)
     seen, held, unseen = (
@@ -146,14 +164,16 @@ def test_what_the_other_folds_said_is_no_better_than_what_is_new(fitted):
     assert held > 0.8 * unseen
 
 
-def test_arrays_there_and_back_and_an_older_kind(fitted):
-    model, _ = fitted
-    features, _, _ = ground(20)
+def test_arrays_there_and_back_and_another_model():
+    features, labels, folds = ground()
+    features = features[:, : 3 + CLASSES + 6]
+    model, *_ = fit_table(features, labels, np.ones_like(labels), folds, channels=CHANNELS, class_count=CLASSES)
     inputs = Inputs(CHANNELS, 40, CHANNELS, 1.0, CLASSES, (), ("power_watt", "velocity_mps"), (1.0, 1.0))
     again = BoostingModel.from_arrays(model.arrays(), inputs).table
     assert np.array_equal(again.predict(features), model.predict(features))
+    trees = {name: array for name, array in model.arrays().items() if name.startswith("trees")}
     with pytest.raises(ModelError, match=r"the weights of another model: curve_.* is missing; train the model again"):
-        BoostingModel.from_arrays(model.forest.arrays(), inputs)
+        BoostingModel.from_arrays(trees, inputs)
 
 
 def test_components_of_bands_are_those_of_their_covariance():

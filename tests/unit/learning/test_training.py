@@ -1,6 +1,7 @@
 """Training: seeded, stopped by a fold of train, gone on from a checkpoint as if nothing had happened."""
 
 import csv
+import io
 import shutil
 from dataclasses import replace
 
@@ -15,7 +16,7 @@ from tcpipe.formats.weights import read_arrays
 from tcpipe.learning import network_model
 from tcpipe.learning.fitting import FitConfig, compute_loss_factors
 from tcpipe.learning.models import HISTORY, WEIGHTS, load_model
-from tcpipe.learning.training import Variant, find_training_range, select_train, train
+from tcpipe.learning.training import find_training_range, train
 from tcpipe.terrain.layers import HEIGHT_NODATA, NODATA_ID
 
 torch = pytest.importorskip("torch")
@@ -83,13 +84,10 @@ def test_intervals_can_rest_on_networks_without_each_fold(trained, dataset, tmp_
     assert is_own[~is_stopping].mean() < 0.1
 
 
-@pytest.mark.parametrize("energy_only", [False, True])
-def test_net_energy_can_be_trained_on(energy_only, dataset, tmp_path):
-    config = replace(CONFIG, epochs=1, label="net")
-    train(dataset, tmp_path / "model", config=config, variant=Variant(energy_only=energy_only))
+def test_net_energy_can_be_trained_on(dataset, tmp_path):
+    train(dataset, tmp_path / "model", config=replace(CONFIG, epochs=1, label="net"))
     card = load_model(tmp_path / "model").card
-    split = open_dataset(dataset, label="net")["train"]
-    names = ("net_energy_joule",) if energy_only else ("net_power_watt", "velocity_mps")
+    split, names = open_dataset(dataset, label="net")["train"], ("net_power_watt", "velocity_mps")
     assert (card.label_energy, card.inputs.outputs) == ("net", names)
     assert card.inputs.scale == pytest.approx(tuple(float(split.column(name).max()) for name in names))
     assert "net of idle power" in (tmp_path / "model" / "MODEL.md").read_text()
@@ -122,10 +120,10 @@ def _stopped(monkeypatch, at, dataset, place, config, **options):
     def write_and_stop(state, path):
         real(state, path)
         epochs.append(state.progress.epoch)
-        if state.progress.epoch == at:
+        if state.progress.epoch == at and epochs.count(at) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(network_model, "_STEPS_BETWEEN", 1)
+    monkeypatch.setattr(network_model, "_SECONDS_BETWEEN", 0.0)
     monkeypatch.setattr(network_model._State, "write", write_and_stop)
     with pytest.raises(KeyboardInterrupt):
         train(dataset, place, config=config, **options)
@@ -143,9 +141,8 @@ def test_a_training_stopped_after_any_checkpoint_goes_on_as_if_nothing_had_happe
     trained, dataset, tmp_path, monkeypatch
 ):
     whole, place = trained[0], tmp_path / "model"
-    assert _stopped(monkeypatch, 0, dataset, place, CONFIG) == [0]  # in the first epoch
-    for epoch in (1, 2, 3):  # the last of them: all is trained, nothing is written
-        assert _stopped(monkeypatch, epoch, dataset, place, CONFIG) == [epoch]
+    for epoch in (0, 1, 2, 3):  # the last of them: all is trained, no model is written
+        assert set(_stopped(monkeypatch, epoch, dataset, place, CONFIG)) == {max(epoch - 1, 0), epoch}
     checkpoint = _checkpoint(place)
     state = checkpoint.read_bytes()
     assert train(dataset, place, config=CONFIG).status == "done"
@@ -156,13 +153,26 @@ def test_a_training_stopped_after_any_checkpoint_goes_on_as_if_nothing_had_happe
     assert not checkpoint.exists()
 
 
-def test_short_epochs_share_a_checkpoint(dataset, tmp_path, monkeypatch):
-    """As many as have 32 steps of 64 samples together, of a training set of a step or two."""
-    epochs = []
-    monkeypatch.setattr(network_model._State, "write", lambda state, _path: epochs.append(state.progress.epoch))
-    monkeypatch.setattr(network_model, "_train_epoch", lambda *_, **__: 1.0)
-    result = train(dataset, tmp_path / "model", config=replace(CONFIG, epochs=45, patience=99, batch_size=64))
-    assert epochs == list(range(0, 46, 32 * 64 // result.samples["fitted"]))
+def test_an_interruption_in_the_middle_of_an_epoch_loses_that_epoch_alone(trained, dataset, tmp_path, monkeypatch):
+    from tcpipe.learning.network import Trainer
+
+    real, count, place = Trainer.step, [], tmp_path / "model"
+
+    def stop_in_the_third_epoch(trainer, *batch):
+        count.append(batch)
+        if len(count) == steps * 2 + 1:
+            raise KeyboardInterrupt
+        return real(trainer, *batch)
+
+    steps = -(-load_model(trained[0]).card.training.samples["fitted"] // CONFIG.batch_size)
+    monkeypatch.setattr(Trainer, "step", stop_in_the_third_epoch)
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, place, config=CONFIG)
+    monkeypatch.setattr(Trainer, "step", real)
+    kept = torch.load(io.BytesIO(_checkpoint(place).read_bytes()[32:]), weights_only=True)
+    assert kept["progress"]["epoch"] == 2
+    assert train(dataset, place, config=CONFIG).status == "done"
+    assert _same(_weights(trained[0]), _weights(place))
 
 
 def test_a_held_out_loss_that_is_no_number_is_gone_on_from(dataset, tmp_path, monkeypatch):
@@ -213,7 +223,7 @@ def test_a_state_holds_the_folds_that_are_predicted(dataset, tmp_path, monkeypat
 
 def test_a_place_that_cannot_be_written_is_found_before_the_first_epoch(dataset, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    monkeypatch.setattr(network_model, "_train_epoch", lambda *_, **__: pytest.fail("an epoch was trained"))
+    monkeypatch.setattr(network_model.NetworkModel, "_train_epoch", lambda *_: pytest.fail("an epoch was trained"))
     with pytest.raises(StoreError, match=r"model\..*\.checkpoint: cannot be written"):
         train(dataset, tmp_path / "file" / "model", config=CONFIG)
 
@@ -240,8 +250,6 @@ def test_weights_count_what_is_certain(dataset, tmp_path, monkeypatch):
 def test_what_cannot_be_trained_on(dataset, tmp_path, monkeypatch):
     with pytest.raises(DatasetError, match="fold 9 of train leaves"):
         train(dataset, tmp_path / "model", config=replace(CONFIG, fold=9))
-    with pytest.raises(DatasetError, match="no labelled samples in split train"):
-        select_train(open_dataset(dataset), Variant(classes=(1,)))
     real = Split.weights.func
     monkeypatch.setattr(Split, "weights", property(lambda split: real(split) * np.array([1.0, 0.0])))
     with pytest.raises(DatasetError, match="no sample has a standard deviation of velocity_mps to weigh it by"):
@@ -306,6 +314,7 @@ def test_a_damaged_one_is_told_or_as_it_was(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("state") / "model.checkpoint"
     state, again = _make_state(), _make_state()
     state.progress = network_model.TrainingProgress(1, 0, float("inf"), [(1, 0.5, float("nan"))])
+    state.keep(path)
     state.write(path)
     raw = bytearray(path.read_bytes())
     at = data.draw(st.integers(0, len(raw) - 1))

@@ -23,6 +23,7 @@ from tcpipe.pipeline.verify import verify
 from tcpipe.planning.cost_grid import ANGLES_DEG, iterate_blocks, make_grid
 from tcpipe.planning.cost_map import make_cost_map, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import Reason
+from tcpipe.terrain.target_grid import MapGrid
 
 MODEL = PhysicsModel()
 
@@ -133,23 +134,75 @@ def test_bands_and_nav2_map_sum_up_the_same_courses_and_say_which(tmp_path):
     assert result.card.aggregation in about
 
 
-def test_nav2_finds_a_scale_map_with_trees_that_are_lethal(made):
-    _, result = made
-    about = YAML(typ="safe").load((Path(result.path) / "energy.yaml").read_text())
+def read_as_map_server(yaml):
+    """Return occupancy, shape (rows, cols), as map_server's loadMapFromYaml in mode scale, and the map's description."""
+    about = YAML(typ="safe").load(yaml.read_text())
     assert about["mode"] == "scale"
-    assert about["free_thresh"] == 0.0
+    grey = matplotlib.image.imread(yaml.parent / about["image"]).astype(float)
+    shade = (grey if about["negate"] else 255.0 - grey) / 255.0
+    scaled = (shade - about["free_thresh"]) / (about["occupied_thresh"] - about["free_thresh"])
+    cost = np.where(
+        shade > about["occupied_thresh"], 100, np.where(shade < about["free_thresh"], 0, np.rint(100 * scaled))
+    )
+    return cost.astype(int), about
+
+
+def read_as_static_layers(occupancy):
+    """Return costs (0 to 254) of `StaticLayer::interpretValue`: in proportion, as up to kilted; by the table of main and lyrical."""
+    old = np.where(occupancy >= 100, 254, (occupancy / 100.0 * 254.0).astype(int))
+    new = np.where(occupancy == 99, 253, np.where(occupancy == 100, 254, np.rint(1 + (occupancy - 1) * 251 / 97)))
+    return old, np.where(occupancy == 0, 0, new).astype(int)
+
+
+def test_nav2_finds_a_scale_map_with_trees_that_are_lethal_and_no_free_cell_lost(made):
+    _, result = made
+    cost, about = read_as_map_server(Path(result.path) / "energy.yaml")
     assert about["origin"] == [500_000.0, 5_200_000.0 - 24.0, 0.0]
-    grey = matplotlib.image.imread(Path(result.path) / about["image"])
-    occupied = (255 - grey.astype(float)) / 255.0
-    cost = np.where(occupied > about["occupied_thresh"], 100, np.rint(100.0 * occupied / about["occupied_thresh"]))
-    assert grey.shape == (24, 24)
+    assert "frame: x and y of EPSG:32633" in (Path(result.path) / "energy.yaml").read_text()
+    assert cost.shape == (24, 24)
     assert cost[5, 20] == 100
-    assert cost[12, 12] < 100
     assert cost[12, 4] > cost[12, 12]
     scale = result.card.nav2_scale["energy"]
     angle = np.radians(ANGLES_DEG)
     mean = energy_joule(4, (0.2 * np.cos(angle) + 0.1 * np.sin(angle)) * 0.9996).mean()
-    assert scale.lowest + cost[12, 12] / 99 * (scale.highest - scale.lowest) == pytest.approx(mean, rel=0.02)
+    assert scale.lowest + cost[12, 12] / 98 * (scale.highest - scale.lowest) == pytest.approx(mean, rel=0.02)
+    costs = open_cost_map(Path(result.path), read_cost_map_card(Path(result.path)))
+    is_free = (costs.reasons == 0).any(axis=0)
+    assert cost[is_free].max() == 98
+    for layer in read_as_static_layers(cost):
+        assert (layer[is_free] < 253).all()
+        assert (layer[~is_free] == 254).all()
+
+
+def test_nav2_maps_of_an_origin_are_true_east_and_north(tmp_path):
+    """2.9 degrees off the central meridian: grid north is turned by 2.1 degrees, 11 m at 300 m."""
+    grid = MapGrid("EPSG:32633", 720_000.0, 5_200_400.0, 2.0, 200, 200)
+    east, _ = np.meshgrid(np.arange(200), np.arange(200))
+    terrain = np.where(np.abs(east - 150) < 3, 2, 4).astype(np.uint8)
+    arrays = {
+        "height": np.full(east.shape, 50.0, np.float32),
+        "ortho": np.full(east.shape, 128, np.uint8),
+        "terrain": terrain,
+    }
+    source = ArrayMap(grid, arrays, 64)
+    lonlat = pyproj.Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True).transform
+    origin = lonlat(720_001.0, 5_200_001.0)
+    make_cost_map(replace(MODEL, patch_px=4), source, tmp_path / "c", cell_size_m=2.0, origin_deg=origin)
+    cost, about = read_as_map_server(tmp_path / "c" / "energy.yaml")
+    assert "true east and north" in (tmp_path / "c" / "energy.yaml").read_text()
+    to_ecef = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform
+    lon, lat = np.radians(origin)
+    turn = np.array([
+        [-np.sin(lon), np.cos(lon), 0.0],
+        [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
+    ])  # fmt: skip
+    zero = np.array(to_ecef(*origin, 0.0))
+    for north in (40.0, 200.0, 360.0):  # the middle of the wall, wherever it is
+        enu = turn @ (np.array(to_ecef(*lonlat(720_301.0, 5_200_001.0 + north), 0.0)) - zero)
+        col = int((enu[0] - about["origin"][0]) / about["resolution"])
+        row = cost.shape[0] - 1 - int((enu[1] - about["origin"][1]) / about["resolution"])
+        assert cost[row, col] == 100
+        assert cost[row, col - 12] < 99
 
 
 def test_qgis_shows_the_mean_from_the_least_to_the_greatest(made):
@@ -249,7 +302,7 @@ def test_the_nav2_frame_begins_at_the_robots_datum_and_nothing_is_predicted_anew
     moved = make_cost_map(never_asked, source, out, cell_size_m=2.0, origin_deg=lonlat)
     assert (plain.status, moved.status) == ("done", "done")
     about = YAML(typ="safe").load((out / "energy.yaml").read_text())
-    assert about["origin"] == pytest.approx([-3.0, -14.0, 0.0], abs=1e-3)
+    assert about["origin"] == pytest.approx([-3.0, -14.0, 0.0], abs=0.02)
     assert moved.card.checksums["energy.tif"] == plain.card.checksums["energy.tif"]
     assert make_cost_map(MODEL, source, out, cell_size_m=2.0, origin_deg=lonlat).status == "unchanged"
     with pytest.raises(UsageError, match=r"km from map .*; give LON,LAT \(longitude first\)"):

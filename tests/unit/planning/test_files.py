@@ -2,10 +2,10 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pyarrow.csv
-import pyarrow.parquet
 import pytest
 from map_worlds import ArrayMap
 from physics_model import PhysicsModel
@@ -15,8 +15,9 @@ from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.geojson import make_line_feature, read_line
 from tcpipe.formats.json_files import write_json
 from tcpipe.planning.cost_map import make_cost_map
-from tcpipe.planning.path_files import make_summary_path, plan, predict_path
+from tcpipe.planning.path_files import find_doubts, make_summary_path, plan, predict_path
 from tcpipe.planning.path_options import PlanPathOptions
+from tcpipe.tables.findings import Subject
 
 MODEL = PhysicsModel(patch_px=8)
 
@@ -36,7 +37,7 @@ def _write_path(path: Path, points) -> None:
     write_json(path, {"type": "FeatureCollection", "features": [make_line_feature(points, {})]})
 
 
-@pytest.mark.parametrize("ending", ["csv", "parquet", "json"])
+@pytest.mark.parametrize("ending", ["csv", "geojson"])
 def test_the_table_is_the_same_in_every_format(source, path, ending):
     out = path.with_name(f"path-segments.{ending}")
     found = predict_path(MODEL, source, path, out)
@@ -44,21 +45,15 @@ def test_the_table_is_the_same_in_every_format(source, path, ending):
     assert found.exit_code == 0
     rows = {
         "csv": lambda: pyarrow.csv.read_csv(out).to_pylist(),
-        "parquet": lambda: pyarrow.parquet.read_table(out).to_pylist(),
-        "json": lambda: json.loads(out.read_text())["path_segments"],
+        "geojson": lambda: [feature["properties"] for feature in json.loads(out.read_text())["features"]],
     }[ending]()
     assert len(rows) == found.path_segments == 18
     assert sum(row["energy_joule"] for row in rows) == pytest.approx(found.energy_joule, rel=1e-9)
     assert rows[0]["terrain_name"] == "grass"
     assert json.loads(make_summary_path(out).read_text())["duration_s"] == found.duration_s
-
-
-def test_parquet_says_units_and_what_the_bits_mean(source, path):
-    out = path.with_name("path-segments.parquet")
-    predict_path(MODEL, source, path, out)
-    schema = pyarrow.parquet.read_schema(out)
-    assert schema.field("energy_joule").metadata[b"unit"] == b"J"
-    assert json.loads(schema.field("reasons").metadata[b"flags"])["2"] == "nodata"
+    if ending == "geojson":  # the lines join up
+        lines = [feature["geometry"]["coordinates"] for feature in json.loads(out.read_text())["features"]]
+        assert all(one[1] == other[0] for one, other in pairwise(lines))
 
 
 def test_a_second_call_does_nothing_until_something_changes(source, path):
@@ -71,6 +66,28 @@ def test_a_second_call_does_nothing_until_something_changes(source, path):
     out.write_text(out.read_text()[:-30])
     assert predict_path(MODEL, source, path, out).status == "done"
     assert predict_path(replace(MODEL, checksum="1" * 64), source, path, out).status == "done"
+
+
+def test_a_way_there_and_back_is_one_path(source, tmp_path):
+    request = _request(source, objective="distance", cell_size_m=2.0, out=tmp_path / "plan.geojson", round_trip=True)
+    found = plan(MODEL, source, request)
+    both = predict_path(MODEL, source, tmp_path / "plan.geojson", None)
+    ways = found.plans["distance"].length_m, found.together.back.length_m
+    assert both.length_m == pytest.approx(sum(ways), rel=1e-3)
+    assert both.energy_joule == pytest.approx(found.together.energy_joule, rel=0.02)
+    _write_path(tmp_path / "one.geojson", lonlat(source, (3.0, 12.0), (20.0, 14.0)))
+    apart = json.loads((tmp_path / "one.geojson").read_text())
+    apart["features"] *= 2
+    (tmp_path / "apart.geojson").write_text(json.dumps(apart))
+    with pytest.raises(PathError, match="of which one does not begin where another ends"):
+        predict_path(MODEL, source, tmp_path / "apart.geojson", None)
+
+
+def test_bends_on_trusted_ground_are_no_warning(source, tmp_path):
+    _write_path(tmp_path / "bend.geojson", lonlat(source, (4.0, 4.0), (8.5, 4.0), (8.5, 8.0)))
+    found = predict_path(MODEL, source, tmp_path / "bend.geojson", None)
+    assert found.reasons == {"curved": 1}
+    assert [of.severity for of in find_doubts(found, Subject("file", "bend"))] == ["note"]
 
 
 def test_a_path_that_leaves_the_map_is_done_in_part(source, tmp_path):
@@ -136,10 +153,9 @@ def test_files_of_the_user_are_left_alone(source, path):
     before = path.read_bytes()
     with pytest.raises(UsageError, match="is no plan; it is not changed"):
         plan(MODEL, source, _request(source, cell_size_m=2.0, out=path))
-    mine = path.rename(path.with_suffix(".json"))
     with pytest.raises(UsageError, match="is the file of the path"):
-        predict_path(MODEL, source, mine, mine)
-    assert mine.read_bytes() == before
+        predict_path(MODEL, source, path, path)
+    assert path.read_bytes() == before
 
 
 def test_names_and_points_that_cannot_be_are_one_line(source, path, tmp_path):

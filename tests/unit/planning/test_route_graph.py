@@ -7,7 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
+import pyproj
 import pytest
+from map_worlds import ArrayMap
 from physics_model import PhysicsModel
 from planning_worlds import NORTH_M, WEST_M, lonlat, plane
 from shared_data import shared_data
@@ -16,6 +18,7 @@ from tcpipe.errors import PathError, UsageError
 from tcpipe.formats.maps.nav2 import make_route_graph, read_route_graph
 from tcpipe.planning.path_cost import compute_path_cost
 from tcpipe.planning.route_graph import connect_lines, write_route_graph
+from tcpipe.terrain.target_grid import MapGrid
 
 MODEL = PhysicsModel()
 
@@ -66,8 +69,10 @@ def test_each_direction_costs_what_predict_path_says_and_nothing_else_changes(hi
     found = _load_as_nav2_does(tmp_path / "out.geojson")
     for way, ends in {(3, 7): [(4.0, 4.0), (14.0, 4.0)], (7, 3): [(14.0, 4.0), (4.0, 4.0)]}.items():
         wanted = compute_path_cost(MODEL, hill, lonlat(hill, *ends), where="edge")
-        assert found[way]["energy_joule"] == pytest.approx(wanted.totals.energy_joule, rel=1e-5)
-        assert found[way]["abs_time_taken"] == pytest.approx(wanted.totals.duration_s, rel=1e-5)
+        assert found[way]["energy_joule"] == pytest.approx(
+            wanted.totals.energy_joule, rel=1e-3
+        )  # ends are in metres of the map
+        assert found[way]["abs_time_taken"] == pytest.approx(wanted.totals.duration_s, rel=1e-3)
         low, high = wanted.totals.energy_interval_joule
         assert found[way]["energy_std_joule"] == pytest.approx((high - low) / 2.0 / 1.645, rel=1e-3)
         assert all(
@@ -81,6 +86,32 @@ def test_each_direction_costs_what_predict_path_says_and_nothing_else_changes(hi
             metadata.pop(name, None)
     after["features"][3]["properties"].pop("metadata")
     assert after == before
+
+
+def test_edges_are_true_enu_lines_far_from_the_central_meridian(tmp_path):
+    """Costs of an edge are those of the line that a robot drives in its east-north-up map frame, by pyproj's own transformation."""
+    grid = MapGrid("EPSG:32633", 720_000.0, 5_200_400.0, 2.0, 200, 200)
+    rows = np.arange(200)[:, None] * np.ones(200)
+    arrays = {
+        "height": (50.0 + 0.2 * rows + 30.0 * np.sin(rows.T / 12.0)).astype(np.float32),
+        "ortho": np.full(rows.shape, 128, np.uint8), "terrain": np.full(rows.shape, 4, np.uint8),
+    }  # fmt: skip
+    ground, model = ArrayMap(grid, arrays, 64), replace(MODEL, patch_px=4)
+    origin = pyproj.Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True).transform(720_030.0, 5_200_030.0)
+    ends = [(20.0, 10.0), (300.0, 300.0)]
+    nodes = [_feature("Point", list(at), id=number) for number, at in enumerate(ends)]
+    given = _write(tmp_path / "graph.geojson", *nodes, _edge(5, 0, 1))
+    write_route_graph(model, ground, tmp_path / "out.geojson", graph=given, store=None, origin_deg=origin)
+    found = _load_as_nav2_does(tmp_path / "out.geojson")[0, 1]
+    enu = pyproj.Transformer.from_pipeline(
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={origin[0]!r} +lat_0={origin[1]!r} +h_0=0 "
+        "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    )
+    east, north = np.array(ends).T
+    lon, lat, _ = enu.transform(east, north, np.zeros(2))
+    wanted = compute_path_cost(model, ground, np.column_stack([lon, lat]), where="edge").totals
+    assert found["energy_joule"] == pytest.approx(wanted.energy_joule, rel=1e-3)
+    assert found["length_m"] == pytest.approx(wanted.length_m, rel=1e-4)
 
 
 def test_edges_without_a_cost_are_left_out_and_named_short_ones_have_one(hill, tmp_path):
