@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcpipe.cli.options import OUTPUT_DIRECTORY, add_options, jobs_option, json_option, quiet_option
+from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, add_options, jobs_option, json_option, quiet_option
 from tcpipe.cli.output import print_json, print_lines, print_result, show_progress
 from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions, RouteGraphOptions
@@ -68,9 +68,7 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 
 
 @click.command()
-@click.argument(
-    "datasets", nargs=-1, required=True, type=click.Path(exists=True, file_okay=False), metavar="DATASET..."
-)
+@click.argument("datasets", nargs=-1, required=True, type=INPUT_DIRECTORY, metavar="DATASET...")
 @click.option(
     "--kinds", multiple=True, type=click.Choice(["linear", "physics", "boosting", "resnet18"]),
     help="Kind of model; repeatable (default: all).",

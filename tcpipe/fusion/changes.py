@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter, uniform_filter1d
 
 from tcpipe.fusion import state
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, Tests
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS
 from tcpipe.fusion.parameters import FIX_AXES, Event
+from tcpipe.fusion.signals import compute_moving_mean
 from tcpipe.fusion.ticks import Ticks
 
 Floats = NDArray[np.float64]
@@ -245,7 +245,7 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> tuple[NDArray[np.float64], tupl
         time_s = _NEAR_ROWS // 3 * period_s * np.median(np.diff(rows))  # from the middle of a window to its median
         moved = 0.5 * _MOST_ACCELERATION_MPS2 * time_s * (time_s if kind == state.FIX else 1.0)
         scattered = _is_outlying(value[rows, kind, axes], least + moved / _WILD)
-        useless = uniform_filter1d(scattered.astype(np.float64), _SPAN_ROWS, mode="constant") > _WILD_SHARE
+        useless = compute_moving_mean(1.0 * scattered, _SPAN_ROWS // 2, least=0.0) > _WILD_SHARE
         rejected = tests.verdict[rows, kind] != ACCEPTED
         for first, last in _find_long_runs(rows, rejected, period_s, kind):
             rejected[first:last] = False
@@ -258,7 +258,11 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> tuple[NDArray[np.float64], tupl
 
 def _is_outlying(series: Floats, least: Floats) -> NDArray[np.bool_]:
     """Return which rows of a series (N, k) are far off their neighbours, at ``least`` by many times as much as that, (N, k)."""
-    off = np.abs(series - median_filter(series, size=(_NEAR_ROWS, 1), mode="nearest"))
+    half = _NEAR_ROWS // 2
+    near = np.lib.stride_tricks.sliding_window_view(
+        np.pad(series, ((half, half), (0, 0)), mode="edge"), _NEAR_ROWS, axis=0
+    )
+    off = np.abs(series - np.median(near, axis=2))
     return np.asarray((off > _WILD * np.maximum(np.median(off, axis=0), least)).any(axis=1))
 
 

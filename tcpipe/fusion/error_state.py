@@ -112,7 +112,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
         start = section.make_start(initial)._replace(x=start.x)
         made = section.filter(start)
         smoothed, events = smooth_section(made)
-    if _is_judging_fixes(section.measurements):
+    if _can_tell_changes(section.measurements):
         explanation = section.explain(made, events, start)
     if explanation.changes:
         made = section.filter(start, explanation)
@@ -123,12 +123,17 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     return make_trajectory(section, made, smoothed, output_ns, explanation)
 
 
-def _is_judging_fixes(m: Measurements) -> bool:
-    """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose better than fixes show it for a minute."""
+def _can_tell_changes(m: Measurements) -> bool:
+    """Return whether a second sensor of motion shows what changed, and fixes show it no worse than the others carry the pose for a minute.
+
+    An IMU and an odometry carry it, or a camera that sees all turns.
+    """
+    if m.gnss is None:
+        return len(m.odometries()) > 1
     carries = (
         bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
     )
-    return carries and (m.gnss is None or float(np.median(m.gnss.variance_m2[:, 0])) < _JUDGED_M**2)
+    return carries and float(np.median(m.gnss.variance_m2[:, 0])) < _JUDGED_M**2
 
 
 def prepare_section(m: Measurements, output_ns: Ints, gate_probability: float) -> SectionModel:

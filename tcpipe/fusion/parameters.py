@@ -87,7 +87,7 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     wanted = {
         "gyroscope bias": has_imu,
         "accelerometer bias": inertial,
-        "lag of fixes": has_tilt,
+        "lag of fixes": m.gnss is not None and has_tilt,
         "turning centre": has_imu,
         "mounting of the IMU": inertial,
         "mounting of the camera": m.visual is not None and bool(m.visual.measured.all()),

@@ -500,8 +500,6 @@ def test_power_that_repeats_slow_readings_is_labelled_as_the_readings_are(drive,
     measured = ("measured_voltages", "measured_currents")
     held = drive.changed("power", lambda c: {name: c[name][np.arange(len(c[name])) // 5 * 5] for name in measured})
     labelled = run(held, tmp_path)
-    (rail,) = labelled.info.report.facts.label.rails["0"]
-    assert rail.current.rate_hz == rail.voltage.rate_hz == pytest.approx(4.0)
     assert_labels_hold(labelled, drive.truth)
     assert labelled.info.report.facts.label.quality["low_power_rate"] == labelled.table.num_rows
     found = preflight(tmp_path / "run.mcap", recipe=Recipe()).findings

@@ -104,6 +104,7 @@ CALLS = [
     "demo other",
     "diff empty empty",
     "diff empty gone",
+    "benchmark other",
     "evaluate other empty",
     "explain id --dataset empty --store empty",
     "explain id --dataset empty --store gone",

@@ -46,7 +46,7 @@ def test_one_line_in_any_wrapping_is_read(tmp_path, document):
         ({"type": "LineString", "coordinates": [[500000.0, 5200000.0], [500010.0, 5200000.0]]}, "projected"),
         ({"type": "Point", "coordinates": [15.0, 47.0]}, "expected one LineString"),
         ({"type": "MultiLineString", "coordinates": [LINE["coordinates"]] * 2}, "expected one LineString"),
-        ({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": LINE}] * 2}, "has 2 features"),
+        ({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": LINE}] * 2}, "has 2 lines"),
     ],
 )
 def test_what_is_no_path_is_one_line_of_error(tmp_path, document, words):

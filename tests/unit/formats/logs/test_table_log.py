@@ -175,14 +175,15 @@ def test_a_run_is_known_by_all_tables_of_its_folder_not_by_what_is_mapped(tmp_pa
 
 def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_path):
     def rows(cells):
-        return "".join(f"17604564{85 + k // 10}.{k % 10},{cells.format(k=k % 10)}\n" for k in range(50))
+        places = 15.0 + 6.6e-7 * np.arange(50)  # 0.5 m/s to the east
+        return "".join(f"17604564{85 + k // 10}.{k % 10},{cells.format(k=k % 10, lon=places[k])}\n" for k in range(50))
 
     folder = folder_with(
         tmp_path,
-        odom=odometry(text="time,vx,yaw_rate\n"),
-        cmd_vel=odometry(text="stamp,linear.x,angular.z\n"),
+        odom="time,vx,yaw_rate\n" + rows("0.50{k},0.0"),
+        cmd_vel="stamp,linear.x,angular.z\n" + rows("0.5,0.0"),
         imu="t,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z\n" + rows("0.{k},0.1{k},0.2{k},0.1{k},0.2,9.8{k}"),
-        fixes="t,Latitude (deg),Longitude (deg),height\n" + rows("47.000000{k},15.000000{k},40{k}"),
+        fixes="t,Latitude (deg),Longitude (deg),height\n" + rows("47.0,{lon:.9f},400"),
         voltage_left="timestamp,value\n" + rows("48.{k}"),
         current_left="timestamp,value\n" + rows("4.{k}"),
         notes="a,b,c\n1,2,3\n",

@@ -25,9 +25,9 @@ def _ros1(share):
 
 @pytest.mark.parametrize(("reader", "tolerance"), [(_nav2, 0), (_nav2_since_2025, 0), (_ros1, 1)])
 def test_costs_are_read_as_written_and_only_lethal_is_lethal(tmp_path, reader, tolerance):
-    cost = np.append(np.arange(HIGHEST + 1), [LETHAL, LETHAL]).astype(np.uint8).reshape(2, 51)
-    grid = MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 2.0, 2, 51)
-    write_nav2_map(tmp_path / "map.yaml", cost, grid, origin_m=(499_900.0, 5_199_000.0), meaning="a cost")
+    cost = np.append(np.arange(HIGHEST + 1), [LETHAL, LETHAL, LETHAL]).astype(np.uint8).reshape(2, 51)
+    grid = MapGrid("ENU", 100.0, 1_000.0, 2.0, 2, 51)
+    write_nav2_map(tmp_path / "map.yaml", cost, grid, frame="true east and north", meaning="a cost")
     about = YAML(typ="safe").load((tmp_path / "map.yaml").read_text())
     needed = {"image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"}  # loadMapYaml throws without
     assert needed <= about.keys()
