@@ -304,7 +304,10 @@ UNLIKE = {
 
 def test_labels_hold_where_fixes_wander_off(drive, tmp_path):
     labelled = run(drive.changed("gnss", astray), tmp_path)
-    assert "gnss" in {of.subject.name for of in labelled.info.report.findings if of.code == "sensor-changed"}
+    assert "gnss" in {
+        of.subject.name for of in select_findings(labelled.info.report.findings, "gnss-contradicts-odometry")
+    }
+    assert labelled.info.report.facts.label.quality["sensors_disagree"] == labelled.table.num_rows
     assert_labels_hold(labelled, drive.truth, within=0.06)
 
 
