@@ -250,9 +250,11 @@ class SectionModel:
             return best
         larger, _ = self._add_events(larger, tests, start)
         has_wrong_span = len(best.changes) > 1 and any(change.kind in {"offset", "useless"} for change in best.changes)
-        if best.score > larger.score and not has_wrong_span:
+        varies = any(change.kind == "varies" for change in larger.changes)
+        has_varying_scale = varies and sum(change.kind == "scale" for change in best.changes) > _FEW_CHANGES
+        if best.score > larger.score and not has_wrong_span and not has_varying_scale:
             return best
-        rivals = sum(change.kind not in FIX_ERRORS for change in best.changes)
+        rivals = 0 if has_varying_scale else sum(change.kind not in FIX_ERRORS for change in best.changes)
         return replace(larger, rival_change_count=rivals if best.score > larger.score + _LEAST_GAIN else 0)
 
     def _find_larger_errors(self, plain: Hypothesis, tests: Tests, start: Memory) -> tuple[Hypothesis, Tests]:
