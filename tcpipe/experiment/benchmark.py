@@ -42,8 +42,9 @@ JSON, PAGE = "benchmark.json", "benchmark.html"
 KINDS: tuple[ModelKind, ...] = ("linear", "physics", "boosting", "resnet18")
 
 _FEWEST_RUNS = 5
-"""Runs without which an error has no interval."""
+"""Runs below which an error has no interval [1]."""
 _UPPER = 0.975
+"""Quantile of Student's t at the upper end of a 95 % interval [1]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +61,7 @@ class BenchmarkRow:
     """Mean over trainings in the quantity's unit, with its 95 % interval over runs and trainings; None below five runs."""
     mape_percent: float | None
     coverage_percent: float | None = None
-    """Of all classes, as the next two: coverage of 90 % intervals."""
+    """Coverage of 90 % intervals. This and the next two are known for all classes together only."""
     crps: float | None = None
     largest_r2: float | None = None
     """Share of the labels' variance that their own noise lets a perfect model explain."""
@@ -80,12 +81,12 @@ class Benchmark:
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkResult:
-    """What was found; ``str`` of it is what the command prints."""
+    """Result of a benchmark; the command prints it by ``str``."""
 
     path: Path
     values: Benchmark
     evaluations: Mapping[tuple[str, str], Sequence[Evaluation]]
-    """By name of the dataset and kind, one of each training."""
+    """Evaluations of all trainings, by name of the dataset and kind."""
 
     def __str__(self) -> str:
         """Return the tables as plain lines."""
@@ -124,6 +125,7 @@ def run_benchmark(
     own_kind: tuple[ModelKind, ...] = () if predictor is None else ("own",)
     evaluations, rows = dict[tuple[str, str], Sequence[Evaluation]](), list[BenchmarkRow]()
     for dataset, name in zip(datasets, names, strict=True):
+        run_of = _read_runs(dataset)
         for kind in (*kinds, *own_kind):
             own = predictor if kind == "own" else None
             count, made, tables, times_s = seeds if _is_random(kind) else 1, list[Evaluation](), list[pa.Table](), []
@@ -139,7 +141,7 @@ def run_benchmark(
                 made.append(done.values)
                 tables.append(read_table(here / "evaluation" / SAMPLES))
             evaluations[name, kind] = made
-            runs = _find_runs(dataset, tables[0])
+            runs = np.array([run_of[sample] for sample in to_texts(tables[0].column("sample_id"))], np.str_)
             rows += _summarize(name, kind, made, tables, runs, float(np.mean(times_s)))
     values = Benchmark(rows=tuple(rows))
     write_json(place / JSON, values)
@@ -161,12 +163,11 @@ def _train(dataset: str | Path, here: Path, config: FitConfig, predictor: str | 
     return float(str(read_json(where)["training_s"]))
 
 
-def _find_runs(dataset: str | Path, table: pa.Table) -> NDArray[np.str_]:
-    """Return the run of each row of a table of predictions."""
+def _read_runs(dataset: str | Path) -> Mapping[str, str]:
+    """Return the run of each evaluated sample of a dataset."""
     data = open_dataset(dataset)
     columns = [(data[split].column("sample_id"), data[split].column("run_id")) for split in SPLITS]
-    known = {sample: run for ids, runs in columns for sample, run in zip(ids.tolist(), runs.tolist(), strict=True)}
-    return np.array([known[sample] for sample in table.column("sample_id").to_pylist()], np.str_)
+    return {sample: run for ids, runs in columns for sample, run in zip(ids.tolist(), runs.tolist(), strict=True)}
 
 
 def _summarize(  # noqa: PLR0917

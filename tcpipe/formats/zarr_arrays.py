@@ -96,7 +96,7 @@ def consolidate_metadata(group: zarr.Group) -> None:
 
 
 DESCRIPTION = "zarr.json"
-"""What an array or a group is, in its directory."""
+"""Name of the file that describes an array or a group."""
 
 _CRC_BYTES = 4
 _ABSENT = 2**64 - 1
@@ -131,7 +131,7 @@ class ShardedArray:
     sparse: bool
     """A shard without a file is all fill value, as in Zarr; otherwise it is damage."""
     codec: Any
-    """What encodes and decodes a chunk, beneath its checksum."""
+    """Codec of a chunk without its checksum."""
     fetched: FetchedShards | None = None
     """Where the shards are; None: on this machine."""
     _indices: dict[tuple[int, ...], NDArray[np.uint64]] = field(default_factory=dict)
@@ -156,7 +156,7 @@ class ShardedArray:
         return out
 
     def expect(self, indices: Iterable[tuple[int, ...]]) -> None:
-        """Have chunks brought here that are read soon, where they lie elsewhere; what cannot be had is told when it is read."""
+        """Fetch remote chunks that will be read soon; a chunk that cannot be fetched raises its error when it is read."""
         if self.fetched is None:
             return
         wanted = [self._shard_and_place(index) for index in indices]

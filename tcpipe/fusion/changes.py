@@ -1,9 +1,9 @@
-"""Changes that explain why sensors contradict each other: fixes step, an antenna moves, a clock steps, a scale or bias changes.
+"""Explain contradictions between sensors by changes: fixes step, an antenna moves, a clock steps, a scale or bias changes.
 
-A change makes one block of the state uncertain at a tick, and again where it ends. `error_state.score_events` tells when, by the log
+A change makes one block of the state uncertain at a tick, and again where it ends. `passes.smooth_section` finds when, by the log
 evidence of such an impulse at every tick. A step of fixes makes them uncertain on both sides, since nothing shows which side is right.
-Errors of fixes may also be larger than they claim throughout; sets of changes are compared by the
-likelihood of all measurements, with what lies beyond the gate counted as the gate, less a cost by kind.
+Errors may also be larger than usual throughout. Sets of changes are compared by the likelihood of all measurements, in which a
+measurement beyond the gate counts as the gate, less a cost by kind.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from tcpipe.fusion import state
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, Tests
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS
 from tcpipe.fusion.parameters import FIX_AXES, Event
-from tcpipe.fusion.signals import compute_moving_mean
+from tcpipe.fusion.signals import SPIKE_RATIO, compute_moving_mean, compute_running_median
 from tcpipe.fusion.ticks import Ticks
+from tcpipe.tables.findings import read_threshold
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -89,8 +90,9 @@ LARGER_ERRORS = {
 _VARIES_S = 5.0
 """Correlation time of a scale or a bias that varies [s]."""
 _STEP_COST = 12.0
-_WIDER = 3.0
-"""Standard deviations of an estimated change that the filter takes for one: it is estimated once more from the same measurements."""
+"""Log of how unlikely a step of fixes is beforehand [nat]."""
+_STD_FACTOR = 3.0
+"""Factor of the standard deviation of an estimated change [1]: the filter estimates it again from the same measurements."""
 _AROUND_STEP_S = 40.0
 """How long before and after a step fixes may drift by as much [s]: corrections age, and ambiguities are resolved slowly."""
 _NOISE_S = 1.5
@@ -99,19 +101,18 @@ _SLOW_S = 60.0
 """Correlation time of a slow error of fixes [s]: the paths of reflected signals change with the satellites."""
 _REJECTED_S = {state.FIX: 1.0, state.WHEELS: 4.0, state.VISUAL: 4.0, state.ATTITUDE: 4.0}
 """How long a sensor that is not wrong may be rejected without a break [s]: wheels slip for seconds."""
-_FEWEST_REJECTIONS = 5
-_MOST_REJECTED = 0.1
-"""Share of a sensor's measurements that may be rejected [1]: wheels slip."""
-_NEAR_ROWS, _WILD = 7, 8.0
-"""Measurements whose median one of them is compared with, and how many times as far off as usual an outlier is [1]."""
-_MOST_ACCELERATION_MPS2 = 3.0
-"""Of a ground robot [m/s²]."""
-_SPAN_ROWS, _WILD_SHARE = 31, 0.2
-"""Measurements in a row, of which so many are outliers where the sensor is useless [1]."""
+_MIN_REJECTIONS = 5
+"""Rejections in a row that are no single outliers [1]."""
+_MEDIAN_ROWS = 7
+"""Measurements whose median one of them is compared with [1]."""
+_MAX_ACCELERATION_MPS2 = 3.0
+"""Acceleration of a ground robot that is no scatter of a sensor [m/s²]."""
+_SPAN_ROWS, _MIN_SPIKE_SHARE = 31, 0.2
+"""Measurements in a row [1], and share of spikes among them above which the sensor is useless [1]."""
 _SAME_EVENT_TICKS = 20
-"""Ticks between events of one block that are one."""
-_LARGEST_REST = 0.4
-"""Of two opposite events, share of the first that the second may leave if it ends the first [1]."""
+"""Ticks between two events of one block, below which they are one event [1]."""
+_MAX_REST = 0.4
+"""Share of a change that a later, opposite one leaves if it ends the change [1]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +145,7 @@ class Change:
             block = EVENTS[self.kind, self.role].block
             for (place, prior_std), found, found_std in zip(block, self.impulse, self.impulse_std, strict=True):
                 is_pose = place < state.GYRO_BIAS  # its errors are along axes that the change turns: they have no mean
-                std, mean = (prior_std, 0.0) if is_pose else (min(prior_std, _WIDER * found_std), found)
+                std, mean = (prior_std, 0.0) if is_pose else (min(prior_std, _STD_FACTOR * found_std), found)
                 yield Event(self.first, place, std, mean)
                 if self.last is not None:
                     yield (
@@ -183,7 +184,7 @@ class Hypothesis:
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """What all changes change in the state, in order of time."""
+        """Events in the state by all changes, in order of time."""
         return tuple(sorted((e for c in self.changes for e in c.list_events()), key=lambda event: event.tick))
 
     def alter_ticks(self, ticks: Ticks, *, drifts: bool = False) -> Ticks:
@@ -203,9 +204,7 @@ class Hypothesis:
         """Alter standard deviation, walk and correlation time of every error, shapes (45,), to those under all changes."""
         offset = slice(state.FIX_OFFSET, state.FIX_OFFSET + 3)
         for change in self.changes:
-            if (
-                change.kind == "step"
-            ):  # either side may be right: both are off by half of it, 1σ, for as long as they last
+            if change.kind == "step":  # either side may be right: both are off by half of it, 1σ
                 std[offset] = np.maximum(std[offset], 0.5 * change.size * FIX_AXES)
             elif change.kind == "slow":
                 std[offset] = np.maximum(std[offset], change.size * FIX_AXES)
@@ -220,18 +219,20 @@ class Hypothesis:
 
 def is_contradicted(tests: Tests, period_s: float) -> bool:
     """Return whether a sensor is rejected more often, or longer without a break, than one that is not wrong."""
+    most = read_threshold("measurements-rejected", "max_rejected_fraction")
     for kind in _REJECTED_S:
         rows = np.flatnonzero(tests.verdict[:, kind] != NONE)
         rejected = tests.verdict[rows, kind] != ACCEPTED
-        if rejected.sum() > _MOST_REJECTED * rows.size or _find_long_runs(rows, rejected, period_s, kind):
+        if rejected.sum() > most * rows.size or _find_long_runs(rows, rejected, period_s, kind):
             return True
     return False
 
 
 def drop_outliers(ticks: Ticks, tests: Tests) -> tuple[NDArray[np.float64], tuple[Change, ...]]:
-    """Return the measurements of ticks without those far off their neighbours, and the spans in which most of a sensor's are.
+    """Return the measurements of ticks without outliers, and the spans in which a sensor scatters so much that it is useless.
 
-    Also what the gate rejects is dropped, but for runs of rejections, which a change may explain.
+    A spike among its neighbours is an outlier, and so is a rejected measurement, except in a long run of rejections, which a change may
+    explain.
     """
     value, spans = ticks.inputs.value.copy(), list[Change]()
     for kind in (state.WHEELS, state.VISUAL, state.FIX):
@@ -241,29 +242,25 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> tuple[NDArray[np.float64], tupl
         axes, period_s = slice(state.SIZES[kind]), ticks.inputs.period_s
         least = np.sqrt(ticks.inputs.variance[rows, kind, axes])
         series = tests.fix_innovation[rows] if kind == state.FIX else value[rows, kind, axes]
-        wild = _is_outlying(series, least)
-        time_s = _NEAR_ROWS // 3 * period_s * np.median(np.diff(rows))  # from the middle of a window to its median
-        moved = 0.5 * _MOST_ACCELERATION_MPS2 * time_s * (time_s if kind == state.FIX else 1.0)
-        scattered = _is_outlying(value[rows, kind, axes], least + moved / _WILD)
-        useless = compute_moving_mean(1.0 * scattered, _SPAN_ROWS // 2, least=0.0) > _WILD_SHARE
+        is_spike = _find_spikes(series, least)
+        time_s = _MEDIAN_ROWS // 3 * period_s * np.median(np.diff(rows))  # from the middle of a window to its median
+        moved = 0.5 * _MAX_ACCELERATION_MPS2 * time_s * (time_s if kind == state.FIX else 1.0)
+        scattered = _find_spikes(value[rows, kind, axes], least + moved / SPIKE_RATIO)
+        useless = compute_moving_mean(1.0 * scattered, _SPAN_ROWS // 2, least=0.0) > _MIN_SPIKE_SHARE
         rejected = tests.verdict[rows, kind] != ACCEPTED
         for first, last in _find_long_runs(rows, rejected, period_s, kind):
             rejected[first:last] = False
-        value[rows[wild | rejected], kind] = np.nan
+        value[rows[is_spike | rejected], kind] = np.nan
         for first, last in _find_long_runs(rows, useless, period_s, kind):
             value[rows[first:last], kind] = np.nan
             spans.append(Change("useless", kind, int(rows[first]), int(rows[last]) if last < rows.size else None))
     return value, tuple(spans)
 
 
-def _is_outlying(series: Floats, least: Floats) -> NDArray[np.bool_]:
-    """Return which rows of a series (N, k) are far off their neighbours, at ``least`` by many times as much as that, (N, k)."""
-    half = _NEAR_ROWS // 2
-    near = np.lib.stride_tricks.sliding_window_view(
-        np.pad(series, ((half, half), (0, 0)), mode="edge"), _NEAR_ROWS, axis=0
-    )
-    off = np.abs(series - np.median(near, axis=2))
-    return np.asarray((off > _WILD * np.maximum(np.median(off, axis=0), least)).any(axis=1))
+def _find_spikes(series: Floats, least: Floats) -> NDArray[np.bool_]:
+    """Return which rows of a series (N, k) are spikes; the usual distance from the median around is ``least`` (N, k) or more."""
+    off = np.abs(series - compute_running_median(series, _MEDIAN_ROWS))
+    return np.asarray((off > SPIKE_RATIO * np.maximum(np.median(off, axis=0), least)).any(axis=1))
 
 
 def _find_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -274,7 +271,7 @@ def _find_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 def _find_long_runs(rows: Ints, mask: NDArray[np.bool_], period_s: float, kind: int) -> list[tuple[int, int]]:
     """Return those runs of measurements at some ticks that last longer than a sensor that is not wrong may be rejected."""
-    runs = [run for run in _find_runs(mask) if run[1] - run[0] >= _FEWEST_REJECTIONS]
+    runs = [run for run in _find_runs(mask) if run[1] - run[0] >= _MIN_REJECTIONS]
     return [(first, last) for first, last in runs if (rows[last - 1] - rows[first] + 1) * period_s >= _REJECTED_S[kind]]
 
 
@@ -292,7 +289,7 @@ def join_events(events: Sequence[Change]) -> tuple[Change, ...]:
         before = joined[-1] if joined and (joined[-1].kind, joined[-1].role) == (event.kind, event.role) else None
         if before is not None and before.last is None:
             rest = np.linalg.norm(np.add(before.impulse, event.impulse))
-            if rest < _LARGEST_REST * np.linalg.norm(before.impulse):
+            if rest < _MAX_REST * np.linalg.norm(before.impulse):
                 joined[-1] = replace(before, last=event.first)
                 continue
         joined.append(event)

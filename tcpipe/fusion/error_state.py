@@ -59,7 +59,7 @@ from tcpipe.fusion.smoother_kernel import Smoothed
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
 from tcpipe.tables.facts import FIX_ERRORS, ChangeFacts, GateReset, ParameterFacts, StretchFacts
-from tcpipe.tables.findings import Subject, make_finding
+from tcpipe.tables.findings import Subject, make_finding, read_threshold
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -69,7 +69,6 @@ _OF_ODOMETRY = {
     state.VISUAL: (state.VISUAL_SCALE, state.VISUAL_SLIP, state.VISUAL_LAG),
 }
 """Errors of an odometry: its mean scale, what it varies by, its lag."""
-_BLOCK = 1024
 _LEVELLING_S = 60.0
 """The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
@@ -78,9 +77,8 @@ _JUDGED_M = 0.5  # fixes that claim more are not judged: motion carries the pose
 _UNCHANGED = Hypothesis(())
 _ARM_STDS, _SURE_STDS = 2.0, 4.0
 """How far off an antenna is that is not where it is stated: deviations of the stated place, and of the estimate [1]."""
-_FEW_CHANGES = 2
-"""Changes in a section that are likely [1]."""
-_MOST_EVENTS = 6
+_MAX_EVENTS = 6
+"""Events of a section [1]: two of them may be one change."""
 _NEARLY_EXACT = 1e-4
 """Standard deviation of errors that are known exactly, in their unit, where events are searched: sigma points need a width."""
 _LEAST_GAIN, _LEAST_FURTHER_GAIN = 100.0, 8.0
@@ -104,7 +102,8 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     section = prepare_section(m, output_ns, gate_probability)
     start, explanation = section.make_start(initial), _UNCHANGED
     minute = round(_LEVELLING_S / section.ticks.inputs.period_s)
-    start.x[:9] = smooth_section(section.filter(start, until=minute))[0].states[0, :9]
+    levelled, _ = smooth_section(section.filter(start, until=minute), with_displacements=False)
+    start.x[:9] = levelled.states[0, :9]
     made = section.filter(start)
     smoothed, events = smooth_section(made)
     if section.is_arm_contradicted(made, smoothed):
@@ -234,7 +233,7 @@ class SectionModel:
 
         ``events`` explain much of the pass ``made``. Smooth errors of fixes, which the filter follows, need no contradiction.
         """
-        period_s = self.ticks.inputs.period_s
+        period_s, most = self.ticks.inputs.period_s, read_threshold("changes-unlikely", "max_change_count")
         excursions = find_excursions(self.residuals, self.noise, self.ticks)
         if not events and not excursions and not is_contradicted(made.tests, period_s):
             return _UNCHANGED
@@ -242,7 +241,7 @@ class SectionModel:
         best, tests_of_best = self._add_events(plain, tests, start)
         if not best.changes and not is_contradicted(tests, period_s):
             return Hypothesis(excursions)
-        if len(best.changes) <= _FEW_CHANGES and not is_contradicted(tests_of_best, period_s):
+        if len(best.changes) <= most and not is_contradicted(tests_of_best, period_s):
             return best
         # Errors may be larger than usual throughout: spans of wrong fixes would explain it, too.
         larger, tests = self._find_larger_errors(plain, tests, start)
@@ -251,7 +250,7 @@ class SectionModel:
         larger, _ = self._add_events(larger, tests, start)
         has_wrong_span = len(best.changes) > 1 and any(change.kind in {"offset", "useless"} for change in best.changes)
         varies = any(change.kind == "varies" for change in larger.changes)
-        has_varying_scale = varies and sum(change.kind == "scale" for change in best.changes) > _FEW_CHANGES
+        has_varying_scale = varies and sum(change.kind == "scale" for change in best.changes) > most
         if best.score > larger.score and not has_wrong_span and not has_varying_scale:
             return best
         rivals = 0 if has_varying_scale else sum(change.kind not in FIX_ERRORS for change in best.changes)
@@ -280,8 +279,8 @@ class SectionModel:
     def _add_events(self, given: Hypothesis, tests: Tests, start: Memory) -> tuple[Hypothesis, Tests]:
         """Return a hypothesis with the events that explain most beyond it, found one after the other; ``tests`` are of its pass."""
         best, events, useless = (given, tests), list[Change](), tuple[Change, ...]()
-        for _ in range(_MOST_EVENTS):
-            kept, spans = drop_outliers(given.alter_ticks(self.ticks), best[1])
+        for _ in range(_MAX_EVENTS):
+            kept, spans = drop_outliers(self.ticks, best[1])
             if not events and spans:
                 useless, best = spans, self._judge((*given.changes, *spans), start)
             hypothesis = replace(given, changes=(*given.changes, *events))

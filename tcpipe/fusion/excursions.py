@@ -17,12 +17,12 @@ from tcpipe.fusion.measurements import GNSS
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, Residuals
 from tcpipe.fusion.ticks import Ticks
 
-_GATE = 4.0  # standard deviations
-_FEWEST_WINDOWS = 3  # overlapping windows
-_SHORTEST_S = 4.0  # single fixes off are for the gate
-_LEAST = 1e-6  # m² or rad²
-_ALIKE_CHANGES = 2.0
-_LONG_S = 8.0
+_GATE = 4.0  # standard deviations of a residual that noise does not reach [1]
+_MIN_WINDOWS = 3  # overlapping windows beyond the gate [1]
+_MIN_WINDOW_S = 4.0  # shortest windows [s]: the filter's gate rejects single fixes
+_MIN_VARIANCE = 1e-6  # of a residual [m² or rad²]
+_MAX_RATIO = 2.0  # of the changes against two odometries that confirm each other [1]
+_LONG_WINDOW_S = 8.0  # shorter excursions may show only a wrong lever arm while the robot turns [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,9 @@ def find_event_candidates(residuals: Sequence[Residuals], noise: NoiseModel) -> 
     ``noise`` was fitted to these residuals. Of candidates of one pair and axis at one time, the one that is farthest beyond stands for all.
     """
     of_fixes = [
-        each for each in residuals if GNSS in each.pair and each.axis in {ALONG, ACROSS} and each.time_s >= _SHORTEST_S
+        each
+        for each in residuals
+        if GNSS in each.pair and each.axis in {ALONG, ACROSS} and each.time_s >= _MIN_WINDOW_S
     ]
     kept: list[EventCandidate] = []
     for candidate in sorted((one for each in of_fixes for one in _find_runs(each, noise)), key=lambda each: -each.z):
@@ -68,7 +70,7 @@ def find_fix_excursions(residuals: Sequence[Residuals], noise: NoiseModel) -> li
     """Return where fixes moved otherwise than two odometries alike, which did not slip at the same time."""
     found = find_event_candidates(residuals, noise)
     # Shorter ones may show only that the antenna is elsewhere than stated while the robot turns.
-    return [one for one in found if one.time_s > _LONG_S and any(_is_confirmed(one, other) for other in found)]
+    return [one for one in found if one.time_s > _LONG_WINDOW_S and any(_is_confirmed(one, other) for other in found)]
 
 
 def _is_confirmed(one: EventCandidate, other: EventCandidate) -> bool:
@@ -77,21 +79,23 @@ def _is_confirmed(one: EventCandidate, other: EventCandidate) -> bool:
     return (
         is_other
         and one.change * other.change > 0.0
-        and abs(other.change) < _ALIKE_CHANGES * abs(one.change) < _ALIKE_CHANGES**2 * abs(other.change)
+        and abs(other.change) < _MAX_RATIO * abs(one.change) < _MAX_RATIO**2 * abs(other.change)
     )
 
 
 def _find_runs(each: Residuals, noise: NoiseModel) -> Iterator[EventCandidate]:
     """Yield each run of overlapping windows beyond the noise."""
     densities = noise.densities.get(each.axis, {})
-    variance = _LEAST + sum((densities.get(name, 0.0) * factor for name, factor in each.features.items()), start=0.0)
+    variance = _MIN_VARIANCE + sum(
+        (densities.get(name, 0.0) * factor for name, factor in each.features.items()), start=0.0
+    )
     z = each.value / np.sqrt(variance)
     beyond = np.flatnonzero(np.abs(z) > _GATE)
     if not beyond.size:
         return
     overlaps = each.start_ns[beyond][1:] < each.end_ns[beyond][:-1]
     for rows in np.split(beyond, np.flatnonzero(~overlaps) + 1):
-        if rows.size < _FEWEST_WINDOWS:
+        if rows.size < _MIN_WINDOWS:
             continue
         worst = rows[np.argmax(np.abs(z[rows]))]
         start_ns = int(each.start_ns[rows[0]])

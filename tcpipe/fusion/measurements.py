@@ -58,7 +58,7 @@ class Positions:
     quat_xyzw, rotation_variance_rad2 : attitude enu_from_base_link, shape (N, 4), NaN where absent, and variance about the robot's axes,
         shape (N, 3); None: no attitude is measured.
     mounting_xyzw, mounting_std_rad : base_link_from_sensor of a pose, stated or as the motion shows it, and σ about each axis.
-    lag_std_s : [s], how late its stamps may be; drivers stamp on arrival.
+    lag_std_s : [s], standard deviation of the delay of its stamps: drivers stamp on arrival.
     """
 
     stamp_ns: NDArray[np.int64]

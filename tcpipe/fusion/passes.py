@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 
 _BLOCK = 1024
 """Ticks between checkpoints."""
-_LEAST_GAIN = 20.0
+_MIN_EVENT_GAIN = 20.0
 """Log evidence [nat] by which an event must explain more, beyond its cost: the best of a section's ticks reaches 12 by chance."""
 _SETTLING_S = 1.0
 """Time after the start in which an event is an error of the start [s]."""
@@ -86,7 +86,7 @@ def smooth_section(made: Pass, *, with_displacements: bool = True) -> tuple[Smoo
             impulse=tuple(change[:count]),
             impulse_std=tuple(change[LARGEST_EVENT : LARGEST_EVENT + count]),
         )
-        if gains[row] >= _LEAST_GAIN and event.size >= EVENTS[kind, role].least:
+        if gains[row] >= _MIN_EVENT_GAIN and event.size >= EVENTS[kind, role].least:
             events.append(event)
     return out, tuple(events)
 

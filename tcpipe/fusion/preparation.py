@@ -70,10 +70,10 @@ _MIN_SCATTER_RATIO = 3.0  # shown over stated scatter: of counts with every othe
 _MEAN_S = 0.5  # averaging of such a velocity
 _MIN_MOVING_MPS = 0.2  # a slower robot may be stationary, and its increments have no direction
 _JITTER_S = 0.05  # less does not matter
-_FILTERS_S, _LEAST_SLOPE_S = 0.2, 1.0
-"""Least lateness of a receiver that filters its places, and time over which an acceleration is seen [s]."""
+_MIN_LATE_S, _MIN_SLOPE_S = 0.2, 1.0
+"""Delay of a receiver from which on it is taken to filter its positions, and shortest window that shows an acceleration [s]."""
 _JITTER_STEPS, _JITTER_STEP_S, _JITTER_MPS = 41, 2.0, 0.3
-"""Of an estimate of jitter: pairs of fixes in a window [1]; longest time between two [s]; slowest motion [m/s]."""
+"""Pairs of fixes in a window of the estimate of jitter [1], longest time between two fixes [s], and slowest motion [m/s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,16 +222,16 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
 
 
 def inflate_late_fixes(gnss: Positions, late_s: float) -> Positions:
-    """Return fixes of a receiver that is late by a time [s] as uncertain as one that filters its places, which most late ones do.
+    """Return fixes with variances raised where their receiver is late [s] and therefore probably filters its positions.
 
-    Behind a first-order low-pass of time τ places are late by τ, and, once that is corrected, off by τ² times the acceleration. Their
-    correlation with speeds shows less than τ.
+    A first-order low-pass of time τ delays positions by τ; once that is corrected, they are off by τ² times the acceleration. Correlation
+    with speeds shows a delay below τ, so that the rest may be as long as the delay.
     """
-    if late_s < _FILTERS_S:
+    if late_s < _MIN_LATE_S:
         return gnss
     axes = list(gnss.position_enu_m[:, :2].T)
     for _ in range(2):
-        axes = [compute_slopes(gnss.stamp_ns, axis, max(2.0 * late_s, _LEAST_SLOPE_S)) for axis in axes]
+        axes = [compute_slopes(gnss.stamp_ns, axis, max(2.0 * late_s, _MIN_SLOPE_S)) for axis in axes]
     variance = gnss.variance_m2.copy()
     variance[:, :2] += ((late_s**2 * np.hypot(*axes)) ** 2)[:, None]
     return replace(gnss, variance_m2=variance, unclaimed=np.ones(len(variance), np.bool_), lag_std_s=late_s)

@@ -25,8 +25,8 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.signals import (
     MAX_ACCELERATION_MPS2,
-    compute_median_of_five,
     compute_median_period_ns,
+    compute_running_median,
     compute_slopes,
     is_covered,
     remove_wild_places,
@@ -108,7 +108,7 @@ def estimate_slope_std_rad(measurements: Measurements) -> float | None:
     if gnss is None or gnss.stamp_ns.size < _FIXES:
         return None
     rows = max(1, round(_CHORD_S * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
-    place_m = np.stack([compute_median_of_five(axis) for axis in gnss.position_enu_m.T])
+    place_m = np.stack([compute_running_median(axis) for axis in gnss.position_enu_m.T])
     east, north, up = place_m[:, rows:] - place_m[:, :-rows]
     way_m = np.hypot(east, north)
     climbs = way_m > _CHORD_M

@@ -15,7 +15,8 @@ Signal = NDArray[Any]
 """Samples of a signal: real, complex or whole numbers."""
 
 _MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
-_SPIKE = 8.0  # distance of a spike over the median distance from the median of five: more than 5 σ
+SPIKE_RATIO = 8.0
+"""Least distance of a spike from the median around it, over the median of such distances [1]: more than 5σ."""
 MAX_GAP_NS = 500_000_000
 """Time between samples that no interpolation bridges [ns]: sensors of motion send at 2 Hz or more."""
 MAX_ACCELERATION_MPS2 = 2.5
@@ -115,20 +116,20 @@ def compute_window_means(stamp_ns: Ints, values: Floats, at_ns: Ints, window_ns:
     return mean
 
 
-def compute_median_of_five(values: Floats) -> Floats:
-    """Return the running median of five of a signal (N,), its ends repeated: single outliers vanish."""
-    if values.size < 5:
+def compute_running_median(values: Floats, rows: int = 5) -> Floats:
+    """Return the median of an odd number of rows around each of a signal (N, ...), its ends repeated: single outliers vanish."""
+    if len(values) < rows:
         return values
-    padded = np.pad(values, 2, mode="edge")
-    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
+    padded = np.pad(values, [(rows // 2, rows // 2)] + [(0, 0)] * (values.ndim - 1), mode="edge")
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, rows, axis=0), axis=-1))
 
 
 def remove_spikes(values: Floats, *, fill: float | None = None) -> Floats:
     """Return a signal (N,) with samples far off the median of five around them, what a filter's gate rejects, interpolated or filled."""
     if values.size < 5:
         return values
-    off = np.abs(values - compute_median_of_five(values))
-    is_spike = off > _SPIKE * float(np.median(off[off > 0.0])) if (off > 0.0).any() else off > 0.0
+    off = np.abs(values - compute_running_median(values))
+    is_spike = off > SPIKE_RATIO * float(np.median(off[off > 0.0])) if (off > 0.0).any() else off > 0.0
     rows = np.arange(values.size)
     return np.where(is_spike, np.interp(rows, rows[~is_spike], values[~is_spike]) if fill is None else fill, values)
 

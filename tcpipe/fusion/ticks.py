@@ -31,8 +31,8 @@ from tcpipe.fusion.process import (
 )
 from tcpipe.fusion.signals import (
     compute_interval_means,
-    compute_median_of_five,
     compute_median_period_ns,
+    compute_running_median,
     compute_seconds,
     compute_slopes,
     is_covered,
@@ -324,7 +324,7 @@ def _compute_acceleration(m: Measurements, stamp_ns: Ints) -> Floats:
 def _compute_slope(source: BodyVelocities, stamp_ns: Ints) -> Floats:
     if source.stamp_ns.size < 3:
         return np.zeros(stamp_ns.size)
-    slope = compute_slopes(source.stamp_ns, compute_median_of_five(source.velocity_mps[:, 0]), _ACCELERATION_WINDOW_S)
+    slope = compute_slopes(source.stamp_ns, compute_running_median(source.velocity_mps[:, 0]), _ACCELERATION_WINDOW_S)
     zero = int(stamp_ns[0])
     found = np.interp(compute_seconds(stamp_ns, zero), compute_seconds(source.stamp_ns, zero), slope)
     return np.where(is_covered(source.stamp_ns, stamp_ns, stamp_ns), found, 0.0)

@@ -163,7 +163,7 @@ class BaselineResult:
     quantity: str
     errors: Errors
     rmse_ratio: Ratio
-    """Of the model over the baseline: below 1 the model is better."""
+    """RMSE of the model divided by that of the baseline: below 1 the model is better."""
     groups: int
     """That the intervals were drawn from."""
     drawn_by: Literal["runs", "blocks"]

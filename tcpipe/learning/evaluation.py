@@ -86,7 +86,7 @@ class EvaluateConfig:
     noise_draws: Annotated[int, Bounds(ge=1, le=1000)] = 5
     """Draws of noise that each ablated input set is the mean of."""
     seed: Seed = 0
-    """Of the noise."""
+    """Seed of the noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ class SplitErrors:
     """Error of the sums of `PATH_M` m of a run, by quantity (T, E)."""
     label_floor: ErrorsByClass
     simulation_floor: ErrorsByClass | None = field(default=None, metadata=ABSENT)
-    """Of what can be predicted at best where the samples were simulated."""
+    """Errors of the best possible predictor; known for simulated samples only."""
     leakage: Leakage | None = field(default=None, metadata=ABSENT)
     """How much of it was met in training; None where nothing trains, or places are not known."""
 
@@ -183,9 +183,9 @@ class Evaluation:
     time: Mapping[str, Mapping[str, Errors]]
     """Table V: errors of T by predictor and split."""
     blocks: ErrorsByClass | None = field(default=None, metadata=ABSENT)
-    """Of the model on blocks of ground that it was not fitted on, which it keeps as its held-out samples."""
+    """Errors of the model on its held-out samples: blocks of ground that it was not fitted on."""
     baselines: tuple[BaselineResult, ...] = ()
-    """Of all classes together, by split, baseline and quantity."""
+    """Comparisons with baselines over all classes, by split, baseline and quantity."""
     repeatability: Mapping[str, Floor | None]
     """How well each label repeats itself where ground was driven twice; None where none was."""
     findings: tuple[Finding, ...] = ()

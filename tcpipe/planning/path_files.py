@@ -227,7 +227,7 @@ class PlanFile:
 
 @dataclass(frozen=True, slots=True)
 class PlanResult:
-    """What was found; ``str`` of it is what the command prints."""
+    """Result of a plan; the command prints it by ``str``."""
 
     objective: Objective
     out: Path

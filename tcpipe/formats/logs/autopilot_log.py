@@ -45,7 +45,7 @@ _STRAY_US, _LATE_US = 1_000_000, 3_600 * 10**6
 _WINDOW = 5
 """Messages in a row by whose median a stray stamp is found."""
 _MOST_DIGITS, _DEEPEST = 5, 5
-"""Of the length of a list in a format, and formats inside formats; what is more is damage."""
+"""Largest number of digits of a list's length, and of levels of formats inside formats [1]; a format with more is damaged."""
 
 Layout = np.dtype[np.void]
 
@@ -81,12 +81,12 @@ def _gather_field(data: bytes, offsets: Int64, layout: Layout, name: str) -> Int
 
 
 _CLOCKS = {"timestamp": 1, "TimeUS": 1, "T": 1000, "TimeMS": 1000}
-"""What one of a time is [µs], by name; ArduPilot's were in milliseconds before 2015, when TimeMS of a GPS was of the week."""
+"""Unit of a time field [µs], by name; ArduPilot wrote milliseconds before 2015, TimeMS of a GPS since the begin of the week."""
 
 
 @dataclass(slots=True)
 class AutopilotRecords:
-    """What a log holds: messages by name (those of instances beside the first end in ``_1`` …), parameters, damage, and lost messages.
+    """Content of a log: messages by name (names of further instances end in ``_1`` …), parameters, damage, and lost messages.
 
     ``dropouts`` counts how often the logger could not keep up.
     """
@@ -255,7 +255,7 @@ class _UlogReader:
         return at >= len(self._data) or (at + 3 <= len(self._data) and self._data[at + 2] in _ULOG_KINDS)
 
     def _find_next(self, start: int) -> int:
-        """Return where the next message of a known topic begins; the end of the file where there is none."""
+        """Return the offset of the next message of a known topic; the size of the file if there is none."""
         at = self._data.find(_DATA, start + 2)
         while 0 <= at <= len(self._data) - 3:
             size, _, number = _ULOG_HEAD.unpack_from(self._data, at - 2)
@@ -305,7 +305,7 @@ class _UlogReader:
         self._by_id[number] = self._topics.setdefault((name, instance), _UlogTopic(name, instance, *layout))
 
     def _make_layout(self, name: str) -> tuple[Layout, int] | str:
-        """Return how messages of a format lie, and their size with what pads them [byte]; or why nobody knows."""
+        """Return the layout of messages of a format and their size with padding [byte], or the reason why they are unknown."""
         fields: list[tuple[str, DTypeLike]] = []
         size = 0
         try:
@@ -387,7 +387,7 @@ def _read_dataflash(records: AutopilotRecords) -> None:
 
 
 def _find_message(data: bytes, start: int, lengths: list[int]) -> int:
-    """Return where the next message begins that another or the end of the file follows; that end where there is none."""
+    """Return the offset of the next message that precedes another one or the end of the file; the file's size if there is none."""
     at = data.find(_HEAD, start)
     while at >= 0 and at + 2 < len(data):
         end = at + lengths[data[at + 2]]

@@ -46,7 +46,7 @@ class BagRecord:
 
     @property
     def opcode(self) -> int:
-        """What kind of record it is."""
+        """Number of the kind of the record."""
         return self.fields.get(b"op", b"\0")[0]
 
     @property
@@ -68,7 +68,7 @@ class BagRecord:
 
 @dataclass(slots=True)
 class ChunkRecords:
-    """What a walk through a chunk met: connections, each connection's messages, where the records end, and how many there are."""
+    """Records of a chunk: connections, each connection's messages, the end of the records, and their number."""
 
     connections: list[BagRecord] = field(default_factory=list)
     offsets: dict[int, list[int]] = field(default_factory=dict)
@@ -186,7 +186,7 @@ def read_indexed_messages(found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
 
 
 def _find_message_fields(header: bytes) -> tuple[int, int]:
-    """Return where in a message's record its connection and its time stand; zeros where the header is none of a message."""
+    """Return the offsets of connection and time in the record of a message; zeros if the header is not that of a message."""
     try:
         fields = parse_header_fields(header)
     except DamageError:

@@ -83,7 +83,7 @@ _EDGES = ("LineString", "MultiLineString")
 
 @dataclass(frozen=True, slots=True)
 class RouteEdge:
-    """A directed edge: ids of it, its start and its end, and its feature as it stands in the file."""
+    """A directed edge: its own id, the ids of the nodes at its start and end, and its feature in the file."""
 
     edge_id: int
     start: int

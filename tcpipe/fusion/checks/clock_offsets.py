@@ -28,9 +28,9 @@ from tcpipe.fusion.checks.motions import (
     Lag,
     average,
     compute_acceleration,
-    compute_course_rate,
     compute_fix_velocity,
     compute_lag_sums,
+    differentiate_course,
     estimate_lag,
     find_coarse_lag,
     find_liveliest_window_ns,
@@ -313,7 +313,7 @@ def _compare_roughly(m: Measurements) -> Iterator[ClockPair]:
     motions = {role: (np.abs(twist[:, 0]), twist[:, 1]) for role, twist in twists.items()}
     if m.gnss is not None:
         velocity = compute_fix_velocity(m.gnss, at_ns)
-        motions[GNSS] = np.abs(velocity), compute_course_rate(velocity)
+        motions[GNSS] = np.abs(velocity), differentiate_course(velocity)
     if m.imu is not None:
         motions[IMU] = np.full(at_ns.size, np.nan), resample_imu(m.imu, at_ns)[0]
     signals = {role: prepare_coarse_signals(*motion) for role, motion in motions.items()}

@@ -137,7 +137,7 @@ def compute_fix_velocity(gnss: Positions, at_ns: Ints) -> Plane:
     return _differentiate(resample_fixes(gnss, at_ns), np.subtract)
 
 
-def compute_course_rate(velocity_mps: Plane) -> Floats:
+def differentiate_course(velocity_mps: Plane) -> Floats:
     """Return how fast the direction of travel turns [rad/s], shape (M,), NaN below 0.2 m/s.
 
     An antenna ahead of the turning point by l leads the body's course by l / v: good for a sign, not for a clock.

@@ -24,9 +24,9 @@ from tcpipe.fusion.checks.motions import (
     Lag,
     average,
     compute_acceleration,
-    compute_course_rate,
     compute_fix_velocity,
     dead_reckon,
+    differentiate_course,
     find_lag,
     find_liveliest_window_ns,
     find_turn,
@@ -377,7 +377,7 @@ def _compare_turns(
 ) -> dict[str, Lag]:
     """Return by sensor how its yaw rate follows from the gyroscope's."""
     rates = {role: average(twist[:, 1], SMOOTH_S) for role, twist in twists.items()}
-    rates |= {} if gnss is None else {GNSS: compute_course_rate(compute_fix_velocity(gnss, at_ns))}
+    rates |= {} if gnss is None else {GNSS: differentiate_course(compute_fix_velocity(gnss, at_ns))}
     lags = {role: find_lag(rate, average(turn, SMOOTH_S)) for role, rate in rates.items()}
     return {role: lag for role, lag in lags.items() if lag is not None and lag.explained > _MIN_AGREEMENT}
 
