@@ -229,6 +229,8 @@ class MaskConfig(_Section):
     """Keep sections driven backwards."""
     max_relative_position_std_m: Deviation = 0.10
     """A section is a gap where the standard deviation of the distance over one chord exceeds this [m]."""
+    max_position_std_m: Deviation | None = field(default=None, metadata=LEFT_OUT)
+    """Rows whose horizontal position has a larger standard deviation (DRMS) are masked; default: no limit [m]."""
     windows: list[TimeWindow] = field(default_factory=list, metadata=LEFT_OUT)
     """Spans of runs that are kept or dropped, as {run = "farm_*", action = "drop", start = 0, end = 30}."""
     windows_csv: str | None = field(default=None, metadata=LEFT_OUT)

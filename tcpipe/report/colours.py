@@ -24,6 +24,7 @@ REASON_COLOURS = {
     DropReason.ACCELERATING: DROPPED,
     DropReason.BELOW_FULL_SPEED: "#0072b2",
     DropReason.TIME_WINDOW: "#999999",
+    DropReason.POSITION_UNCERTAIN: "#aa3377",
 }
 """Reasons why a row of the track is not used, on the map and over time."""
 LINE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", FAINT)

@@ -262,6 +262,7 @@ REASON_WORDS = {
     DropReason.ACCELERATING: "the speed changes",
     DropReason.BELOW_FULL_SPEED: "commanded below full speed: the terrain does not limit the speed",
     DropReason.TIME_WINDOW: "outside the recipe's time windows",
+    DropReason.POSITION_UNCERTAIN: "the position is less certain than the recipe requires",
 }
 """Why a row of the track is not used."""
 

@@ -63,6 +63,9 @@ def mask_track(
         found[DropReason.BELOW_FULL_SPEED] = masks.find_below_full_speed(
             rows, limit_mps=slowest, window_s=config.command_window_s
         )
+    if config.max_position_std_m is not None:
+        std_m = np.hypot(to_floats(table, "x_std_m"), to_floats(table, "y_std_m"))
+        found[DropReason.POSITION_UNCERTAIN] = ~(std_m <= config.max_position_std_m)
     dropped_by = np.bitwise_or.reduce([np.uint32(reason) * mask for reason, mask in found.items()])
     outside, window_findings = find_outside_windows(track, config.windows)
     dropped_by = np.where(outside, np.uint32(DropReason.TIME_WINDOW), dropped_by)

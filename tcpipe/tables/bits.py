@@ -34,6 +34,8 @@ class DropReason(IntFlag):
     """Commanded below 0.95 of the robot's maximum: the terrain does not limit the speed."""
     TIME_WINDOW = 1 << 7
     """Outside the time windows of the recipe (`mask.windows`); no other reason counts there."""
+    POSITION_UNCERTAIN = 1 << 8
+    """Standard deviation of the horizontal position (DRMS) above `mask.max_position_std_m`; off unless the recipe states a limit."""
 
 
 class Quality(IntFlag):
@@ -82,7 +84,7 @@ class Loss(IntFlag):
     NOT_TRAVERSABLE = 1 << 20
     """The class under the chord is not traversable."""
     POSITION_UNCERTAIN = 1 << 21
-    """Absolute position standard deviation above `sample.max_position_std_m` when sampling."""
+    """Standard deviation of the horizontal position above `sample.max_position_std_m` when sampling; adds to that of the mask."""
     SPLIT_BUFFER = 1 << 22
     """The footprint crosses the border of a region, or is nearer to it than the buffer."""
     NO_POWER = 1 << 23

@@ -15,7 +15,7 @@ from tcpipe.tables.columns import to_floats
 
 REASONS = [
     *("kept", "gap", "stationary", "stuck", "turning_in_place", "reversing", "accelerating", "below_full_speed"),
-    *("time_window", "curved", "leftover"),
+    *("time_window", "position_uncertain", "curved", "leftover"),
 ]
 FINE = 50
 """Steps of the truth to one row of the track."""

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_tracks import make_track, stamps, straight_track
+from made_tracks import make_track, stamps, straight_track, with_columns
 
 from tcpipe.errors import FusionError, RecipeError
 from tcpipe.formats.recipe_toml import ingest_key, load_recipe
@@ -238,6 +238,18 @@ def test_a_run_that_is_mostly_faster_than_plausible_is_refused():
     with pytest.raises(FusionError) as error:  # the recipe's goes first
         mask_track(track, MaskConfig(max_plausible_mps=20.0), **robot, max_plausible_mps=1e4)
     assert error.value.findings[0].numbers["limit_mps"] == 20.0
+
+
+@pytest.mark.parametrize(("limit_m", "first_s"), [(0.5, 30.0), (1.0, 60.0), (None, 60.0)])
+def test_metres_with_an_uncertain_position_have_a_reason_of_their_own(limit_m, first_s):
+    track = straight_track(np.full(T.size, 0.5))
+    std_m = np.where(T < 30.0, 0.3, 0.4)  # DRMS of two equal axes: 0.42 and 0.57 m
+    track = replace(track, table=with_columns(track.table, x_std_m=std_m, y_std_m=std_m))
+    masked = gate(track, config=MaskConfig(max_position_std_m=limit_m))
+    assert (rows_of(masked, DropReason.POSITION_UNCERTAIN) == (first_s <= T)).all()
+    lost = segment_track(masked, SegmentConfig()).distance_by_reason_m
+    assert lost["position_uncertain"] == pytest.approx(0.5 * (60.0 - first_s), abs=0.06)
+    assert sum(lost.values()) == pytest.approx(30.0, abs=0.05)
 
 
 def windows(*given):
