@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageColor, UnidentifiedImageError
 from pyproj import Transformer
 
 from tcpipe.formats.atomic import write_atomic_file
@@ -67,7 +67,7 @@ def make_sheet(patches: NDArray[np.uint8]) -> Bytes:
 
 def colour_classes(ids: NDArray[np.integer]) -> Bytes:
     """Return class ids of any shape as colours, one axis more; 0, no data, is white."""
-    table = np.array([_parse_rgb("#ffffff"), *map(_parse_rgb, CLASS_COLOURS)], np.uint8)
+    table = np.array([*map(ImageColor.getrgb, ("#ffffff", *CLASS_COLOURS))], np.uint8)
     index = np.where(ids > 0, (ids.astype(np.int64) - 1) % len(CLASS_COLOURS) + 1, 0)
     picture: Bytes = table[index]
     return picture
@@ -82,10 +82,6 @@ def colour_heights(values: NDArray[np.float64]) -> Bytes:
     places = np.linspace(0.0, 1.0, len(_CIVIDIS))
     colours = np.stack([np.interp(share, places, _CIVIDIS[:, channel]) for channel in range(3)], axis=-1)
     return np.where(known[..., None], colours, 255.0).astype(np.uint8)
-
-
-def _parse_rgb(colour: str) -> Sequence[int]:
-    return [int(colour[n : n + 2], 16) for n in (1, 3, 5)]
 
 
 _SIDE_PX = 900
@@ -275,7 +271,7 @@ def _open_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Pat
     splits = samples.column("split").to_numpy(zero_copy_only=False)
     place = find_places_in_files(card, splits)
     piece = np.searchsorted(files.starts, place, side="right") - 1
-    return _Patches(files, place, piece, choose_thinning(card.patch_px))
+    return _Patches(files, place, piece, -(-card.patch_px // _PX))
 
 
 def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, count: int) -> Json:
@@ -287,21 +283,11 @@ def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, cou
         return None
     patches = _open_patches(directory, card, samples)
     rows = patches.select(samples.slice(0, count))
-    return make_sheets(rows.tolist(), patches.read(rows), patches.files)
-
-
-def choose_thinning(patch_px: int) -> int:
-    """Return the step in which pixels of a patch are shown."""
-    return -(-patch_px // _PX)
-
-
-def make_sheets(rows: Sequence[int], pixels: Mapping[str, NDArray[Any]], files: PatchFiles) -> Json:
-    """Return thinned patches, (N, px, px) by layer, as a sheet for each layer, and the rows of the page that they belong to."""
-    layers: list[Json] = []
-    for name, stack in _join_colours(pixels).items():
-        sheet, exact = _make_sheet(name, stack, files, _find_range(stack))
+    pixels, layers = patches.read(rows), list[Json]()
+    for name, stack in pixels.items():
+        sheet, exact = _make_sheet(name, stack, patches.files, _find_range(stack))
         layers.append({"name": name, "uri": make_picture_uri(sheet, exact=exact)})
-    return {"rows": rows, "px": next(iter(pixels.values())).shape[1], "across": ACROSS, "layers": layers}
+    return {"rows": rows.tolist(), "px": next(iter(pixels.values())).shape[1], "across": ACROSS, "layers": layers}
 
 
 def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
