@@ -1,6 +1,6 @@
 """tcpipe: from raw robot logs to datasets that a terrain-cost model can be trained on.
 
-The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dataset`, `rebuild`, `check_split`, `open_dataset`,
+The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dataset`, `open_dataset`,
 `train`, `evaluate`, `predict_path`, `plan_path`. They are loaded when they are first used, so that ``import tcpipe`` costs nothing;
 ``__init__.pyi`` gives editors and type checkers the module of each.
 """
@@ -17,9 +17,7 @@ _HOMES = {
     "ingest": ("tcpipe.pipeline.ingest", "ingest"),
     "add_map": ("tcpipe.pipeline.maps", "add_map"),
     "build_dataset": ("tcpipe.pipeline.dataset.build", "build_dataset"),
-    "check_split": ("tcpipe.pipeline.split_check", "check_split"),
     "open_dataset": ("tcpipe.dataset", "open_dataset"),
-    "rebuild": ("tcpipe.pipeline.rebuild", "rebuild"),
     "train": ("tcpipe.api", "train"),
     "evaluate": ("tcpipe.api", "evaluate"),
     "predict_path": ("tcpipe.api", "predict_path"),
@@ -30,7 +28,6 @@ __all__ = [
     "__version__",
     "add_map",
     "build_dataset",
-    "check_split",
     "errors",
     "evaluate",
     "ingest",
@@ -38,7 +35,6 @@ __all__ = [
     "plan_path",
     "predict_path",
     "read_log",
-    "rebuild",
     "train",
 ]
 

@@ -5,8 +5,6 @@ from tcpipe.formats.logs.log_joining import open_single_log as read_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
-from tcpipe.pipeline.rebuild import rebuild
-from tcpipe.pipeline.split_check import check_split
 
 __version__: str
 
@@ -14,7 +12,6 @@ __all__ = [
     "__version__",
     "add_map",
     "build_dataset",
-    "check_split",
     "errors",
     "evaluate",
     "ingest",
@@ -22,6 +19,5 @@ __all__ = [
     "plan_path",
     "predict_path",
     "read_log",
-    "rebuild",
     "train",
 ]

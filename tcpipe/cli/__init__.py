@@ -42,7 +42,6 @@ _COMMANDS = {
     "prune": ("log_commands", "Remove what a store no longer needs"),
     "add-map": ("dataset_commands", "Add the rasters of a site to the store"),
     "build-dataset": ("dataset_commands", "Build a dataset from segments and maps"),
-    "check-split": ("dataset_commands", "Judge the split of any table for spatial leakage"),
     "train": ("model_commands", "Train a model on a dataset"),
     "evaluate": ("model_commands", "Evaluate a model and compare it with the paper"),
     "benchmark": ("model_commands", "Compare all kinds of model on datasets"),
@@ -57,7 +56,6 @@ _COMMANDS = {
     "explain": ("dataset_commands", "Trace a sample to its log"),
     "verify": ("dataset_commands", "Read all files again, compare counts and checksums"),
     "diff": ("dataset_commands", "List the differences of two datasets, by cause"),
-    "rebuild": ("dataset_commands", "Build a dataset again from its own record"),
     "simulate": ("site_commands", "Write a simulated site with its true values"),
 }
 """The module and the purpose of each command, in the order a user meets them; the command NAME-X is the function NAME_X there."""

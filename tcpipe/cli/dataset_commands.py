@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from tcpipe.cli.options import (
-    INPUT_DIRECTORY,
     LOG,
     OUTPUT_DIRECTORY,
     SEALED,
     add_options,
     add_path_or_run,
-    jobs_option,
     json_option,
     msgdef_option,
     quiet_option,
@@ -32,7 +30,7 @@ from tcpipe.cli.output import (
     show_progress,
 )
 from tcpipe.errors import UsageError
-from tcpipe.pipeline.options import AddMapOptions, BuildDatasetOptions, CheckSplitOptions
+from tcpipe.pipeline.options import AddMapOptions, BuildDatasetOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.export import Exported
@@ -83,23 +81,6 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
     else:
         print_lines(result.format())
     return result.exit_code
-
-
-@click.command("check-split")
-@add_options(CheckSplitOptions)
-@json_option
-def check_split(options: CheckSplitOptions, *, as_json: bool) -> int:
-    """Judge the train/test split of TABLE (.parquet or .csv) for spatial leakage.
-
-    A sample leaks if its footprint shares ground with a training footprint, or if it is next to a training sample on its run.
-
-    Exit code 3: a larger share of a held-out split than --limit leaks.
-    """
-    from tcpipe.pipeline.split_check import run_check_split
-
-    result = run_check_split(options)
-    print_result(result, as_json=as_json)
-    return 3 if result.above_limit else 0
 
 
 @click.command()
@@ -217,25 +198,3 @@ def diff(a: str, b: str, *, as_json: bool) -> int:
     found = run(a, b)
     print_result(found, as_json=as_json)
     return 0 if found.same else 1
-
-
-@click.command()
-@click.argument("dataset", type=SEALED, metavar="DATASET")
-@click.option("--logs", required=True, type=INPUT_DIRECTORY, metavar="DIR", help="Folder with all logs and files.")
-@click.option("--to", type=OUTPUT_DIRECTORY, metavar="NEW", help="Keep the rebuilt dataset here (default: remove it).")
-@jobs_option("Logs and runs")
-@json_option
-@quiet_option
-def rebuild(dataset: str, *, logs: str, to: str | None, jobs: int, as_json: bool, quiet: bool) -> int:
-    """Build DATASET again from its own record, and compare the result with it.
-
-    tcpipe finds logs, rasters, covariates and lists of samples below DIR by their content, whatever they are called.
-
-    Exit code 0: identical. 3: changed, and the line names the cause. 1: a file is missing or altered; a line for each.
-    """
-    from tcpipe.pipeline.rebuild import rebuild as run
-
-    with show_progress("rebuild", quiet=quiet):
-        found = run(dataset, logs=logs, to=to, jobs=jobs)
-    print_result(found, as_json=as_json)
-    return 0 if found.is_identical else 3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -78,7 +77,7 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
     Without ``time_column`` the only one that has its name; ``time_unit`` is of stamps that are numbers, text is ISO 8601, and UTC where it
     names no zone. `DatasetError`: it cannot be read, has no time, or two rows of one time differ.
     """
-    table, _ = read_rows(path)
+    table = _read_rows(path)
     column = _time_column(path, table, time_column)
     stamps = _parse_stamps(path, table[column], time_unit)
     known = stamps.is_not_null()
@@ -103,11 +102,8 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
     return CovariateTable(path.name, compute_checksum(path), column, rows, tuple(findings))
 
 
-def read_rows(path: Path, names: Collection[str] | None = None) -> tuple[pl.DataFrame, list[str]]:
-    """Return the columns of a CSV or Parquet file that are among ``names`` (None: all), categories as text, and the names of all.
-
-    Raises `DatasetError` if the file cannot be read.
-    """
+def _read_rows(path: Path) -> pl.DataFrame:
+    """Return the columns of a CSV or Parquet file, categories as text; `DatasetError` if it cannot be read."""
     try:
         if path.suffix.lower() == ".parquet":
             rows = pl.scan_parquet(path, glob=False)
@@ -116,9 +112,7 @@ def read_rows(path: Path, names: Collection[str] | None = None) -> tuple[pl.Data
                 head = file.readline(_LONGEST_HEAD).decode("utf-8", "replace")
             mark = max(",;\t", key=head.count)
             rows = pl.scan_csv(path, separator=mark, infer_schema_length=None, null_values=_NO_VALUE, glob=False)
-        there = rows.collect_schema().names()
-        wanted = rows.select(there if names is None else [name for name in there if name in names])
-        return wanted.cast({pl.Categorical: pl.String}).collect(), there
+        return rows.cast({pl.Categorical: pl.String}).collect()
     except (pl.exceptions.PolarsError, OSError, ValueError) as error:
         raise DatasetError(
             f"{path}: not a readable table ({str(error).splitlines()[0]}); expected CSV or Parquet"

@@ -30,11 +30,6 @@ class RunInputs:
     """Checksum of its log."""
     segments_sha256: str | None
     tags: Mapping[str, str]
-    size_bytes: int = 0
-    """Size of its log; 0: not recorded."""
-    parts: tuple[Checksum, ...] = field(default=(), metadata=LEFT_OUT)
-    """Size and sha256 of each log, in order, where several were ingested as one."""
-    robot_requested: str | None = field(default=None, metadata=LEFT_OUT)
     message_definitions: str = field(default="", metadata={"json": ("",)})
     """Hash of the definitions that were given for types which the log does not define."""
 

@@ -2,7 +2,7 @@
 
 ::
 
-    dataset.json  croissant.json  README.md  samples.parquet  report.html
+    dataset.json  croissant.json  samples.parquet  report.html
     overview.png  relief.png  classes.png                    the map, small, as the report shows it
     excluded.csv                                             ids that a user excluded, why, and whether they were samples
     report-patches/                                          pictures of all patches, after `tcpipe report --patches`
@@ -53,7 +53,6 @@ LayerPixels = NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]
 
 CARD = "dataset.json"
 CROISSANT = "croissant.json"
-HUB_CARD = "README.md"
 SAMPLES = "samples.parquet"
 PATCHES = "patches.zarr"
 SHARDS = "data"

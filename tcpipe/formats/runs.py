@@ -199,8 +199,6 @@ class LogOrigin:
     """Data that was hashed: the whole log, or, if only part of it was downloaded, the sizes and indexes of its files."""
     outline: str = field(default="", metadata=LEFT_OUT)
     """Hash of the size and index of the log, by which it is known where not all of it is at hand; "" where it has none."""
-    parts: tuple[Checksum, ...] = field(default=(), metadata=LEFT_OUT)
-    """Size and sha256 of each log, in order, where several were ingested as one."""
 
 
 @dataclass(frozen=True, slots=True)

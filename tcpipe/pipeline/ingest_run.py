@@ -17,7 +17,7 @@ from tcpipe.errors import LogError
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.integrity import compute_checksums
 from tcpipe.formats.json_files import to_plain
-from tcpipe.formats.logs.log_joining import AnyLog, JoinedLog, open_logs
+from tcpipe.formats.logs.log_joining import AnyLog, open_logs
 from tcpipe.formats.parquet import add_segments_metadata, return_freed_memory, write_table
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, make_recipe_id, read_key
 from tcpipe.formats.runs import Counts, LogOrigin, Recording, Run, RunFacts, Tags, TopicCount, list_physics_terms
@@ -196,7 +196,6 @@ def make_run(
     info = add_findings(info, found, info.report.facts)
     label, messages = info.report.facts.label, {role: rows.num_rows for role, rows in streams.tables.items()}
     by_index = sha256 == log.outline or (log.is_known_by_outline and sha256 == log.sha256())
-    parts = log.parts if isinstance(log, JoinedLog) and len(log.parts) > 1 else ()
     return Run(
         run_id=info.run_id,
         recipe_id=make_recipe_id(task.recipe, streams.robot),
@@ -208,9 +207,7 @@ def make_run(
         robot=streams.robot,
         robot_requested=task.robot,
         message_definitions=task.definitions,
-        log=LogOrigin(
-            task.source.origins, sha256, log.size_bytes, "index" if by_index else "log", log.outline or "", parts
-        ),
+        log=LogOrigin(task.source.origins, sha256, log.size_bytes, "index" if by_index else "log", log.outline or ""),
         recording=describe_recording(streams),
         sensors=streams.sensors,
         segments=table.num_rows,

@@ -78,8 +78,7 @@ def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
     if "height" not in files:
         raise UsageError(f"map {name}: no height raster; give --height FILE")
     store, state = call.store, call.state
-    main_files = {role: _name_files(paths, paths) for role, paths in sorted(files.items())}
-    inputs = MapInputs(_compute_checksums(files), main_files, options.crs, tuple(sorted(categorical)), bands)
+    inputs = MapInputs(_compute_checksums(files), options.crs, tuple(sorted(categorical)), bands)
     more = MoreLayers(
         {name: files[name] for name in layers},
         {name: files[f"{name} {CLASSES}"][0] if table else None for name, table in categorical.items()},

@@ -218,36 +218,3 @@ class BuildDatasetOptions:
         False, Option("Replace a dataset that was made with other options (region, map, tags, recipe …).")
     )
     dry_run: bool = option(False, DRY_RUN)
-
-
-@dataclass(frozen=True, slots=True)
-class CheckSplitOptions:
-    """Which table is judged, what its columns are, and how much leakage is too much."""
-
-    table: str | Path = required(Option(kind="input_file", metavar="TABLE", is_argument=True))
-    _: KW_ONLY
-    xy: str | Sequence[str] = required(
-        Option("Columns of the position: metres in one frame, or longitude,latitude; four columns: start and end.", metavar="X,Y")
-    )  # fmt: skip
-    """Names with commas between, or a list. With start and end, the footprint is around the middle and turned along the direction."""
-    split: str = option("split", Option("Column of the split of each sample.", metavar="COLUMN"))
-    run: str | None = option(
-        None, Option("Column of the run; without it, neighbours on a run are not judged.", metavar="COLUMN")
-    )
-    time: str | None = option(
-        None, Option("Column that orders the samples of a run (default: their rows).", metavar="COLUMN")
-    )
-    train: str = option("train", Option("Split of the training samples.", metavar="NAME"))
-    unused: str | Sequence[str] = option(
-        ("buffer",),
-        Option("Split that is not judged, as rows without one; repeatable.", metavar="NAME", repeatable=True),
-    )
-    footprint_m: float = option(
-        1.0, Option("Side of the square of ground that a sample shows.", ("--footprint",), Range(0.0, 1e6, is_open=True), "METRES")
-    )  # fmt: skip
-    limit_fraction: float = option(
-        0.01, Option("Share of a held-out split that may leak; above it, exit code 3.", ("--limit",), Range(0.0, 1.0), "SHARE")
-    )  # fmt: skip
-    html: str | Path | None = option(
-        None, Option("Write a page with a map and the figures.", (), "output_file", "FILE")
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -37,47 +36,10 @@ LOCAL_PLACES = ("start_x_m", "start_y_m", "end_x_m", "end_y_m")
 _M_A_DEG = 111_195.0  # of a great circle: to half a per cent
 
 
-@dataclass(frozen=True, slots=True)
-class Leakage:
-    """A held-out split against train; arrays are of its samples ``rows``, shape (M,)."""
-
-    rows: Ints
-    train_neighbours: Ints
-    """Number of training samples that follow or precede each sample on its track."""
-    shares_ground: Mask
-    """Whether its footprint shares ground with a training footprint."""
-    repeats_place: Mask
-    """Whether that training footprint is of another run."""
-    nearest_m: Floats
-    """Distance to the nearest training footprint [m]; empty without training samples."""
-    overlapping_pairs: int
-    """Pairs of a held-out and a training footprint that share ground."""
-
-
 def audit_leakage(
     train: Mask, held: Mapping[str, Mask], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
 ) -> tuple[HeldOut, ...]:
-    """Return the counts of each split that is ``held`` out against train; parameters as for `measure_leakage`."""
-    measured = measure_leakage(train, held, run, start_ns, corners_xy_m, chord_m=chord_m)
-    return tuple(
-        HeldOut(
-            split=name,
-            samples=len(part.rows),
-            overlapping_samples=int(part.shares_ground.sum()),
-            overlapping_pairs=part.overlapping_pairs,
-            same_track_pairs=int(part.train_neighbours.sum()),
-            repeated_place_samples=int(part.repeats_place.sum()),
-            nearest_train_min_m=float(part.nearest_m.min()) if len(part.nearest_m) else None,
-            nearest_train_median_m=float(np.median(part.nearest_m)) if len(part.nearest_m) else None,
-        )
-        for name, part in measured.items()
-    )
-
-
-def measure_leakage(
-    train: Mask, held: Mapping[str, Mask], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
-) -> dict[str, Leakage]:
-    """Return by its name, for each split that is ``held`` out, what its samples share with train.
+    """Return, for each split that is ``held`` out, how much ground and how many neighbours its samples share with train.
 
     Parameters
     ----------
@@ -86,12 +48,12 @@ def measure_leakage(
     corners_xy_m : corners of the footprints [m], shape (N, 4, 2).
     chord_m : segment length [m]; samples follow one another if their centres are at most 1.5 chords apart.
     """
-    neighbours = count_neighbours(train, run, start_ns, corners_xy_m, chord_m=chord_m)
+    neighbours = _count_neighbours(train, run, start_ns, corners_xy_m, chord_m=chord_m)
     ground = Ground(corners_xy_m, np.flatnonzero(train))
-    return {name: _measure_split(np.flatnonzero(is_held), run, ground, neighbours) for name, is_held in held.items()}
+    return tuple(_audit_split(name, np.flatnonzero(is_held), run, ground, neighbours) for name, is_held in held.items())
 
 
-def count_neighbours(train: Mask, run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float) -> Ints:
+def _count_neighbours(train: Mask, run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float) -> Ints:
     """Return how many training samples follow or precede each sample on its track, shape (N,)."""
     order, found = np.lexsort((start_ns, run)), np.zeros(len(run), np.int8)
     for first in range(0, len(order) - 1, _CHUNK):
@@ -117,7 +79,7 @@ class Ground:
         self.tree = cKDTree(centres)
 
 
-def _measure_split(held: Ints, run: Ints, train: Ground, neighbours: Ints) -> Leakage:
+def _audit_split(name: str, held: Ints, run: Ints, train: Ground, neighbours: Ints) -> HeldOut:
     pairs, apart_m = 0, [np.empty(0)]
     shares, repeats = np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
     for part in _split_points(np.arange(len(held)), _CHUNK) if len(train.rows) else []:
@@ -131,7 +93,17 @@ def _measure_split(held: Ints, run: Ints, train: Ground, neighbours: Ints) -> Le
         shares[part[i[real]]] = True
         repeats[part[i[real & (run[rows[i]] != run[j])]]] = True
         apart_m.append(compute_nearest_m(queries, train))
-    return Leakage(held, neighbours[held], shares, repeats, np.concatenate(apart_m), pairs)
+    nearest_m = np.concatenate(apart_m)
+    return HeldOut(
+        split=name,
+        samples=len(held),
+        overlapping_samples=int(shares.sum()),
+        overlapping_pairs=pairs,
+        same_track_pairs=int(neighbours[held].sum()),
+        repeated_place_samples=int(repeats.sum()),
+        nearest_train_min_m=float(nearest_m.min()) if len(nearest_m) else None,
+        nearest_train_median_m=float(np.median(nearest_m)) if len(nearest_m) else None,
+    )
 
 
 def compute_middles(ends: Sequence[NDArray[np.generic]]) -> Floats:

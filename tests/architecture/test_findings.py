@@ -18,7 +18,6 @@ MAKERS = {"make_finding": 0, "Damage": 0, "DamageError": 0, "threshold": 0, "sel
 
 PRINTERS = {
     "tcpipe/formats/dataset_card.py",
-    "tcpipe/formats/hub_card.py",
     "tcpipe/formats/logs/log_file.py",
     "tcpipe/learning/evaluation_files.py",
     "tcpipe/pipeline/dataset/build.py",

@@ -34,8 +34,6 @@ class MapInputs:
     """Inputs of a map: the sha256 of each file of each role, and the CRS that the user gave."""
 
     files: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    main_files: Mapping[str, tuple[str, ...]] = field(default_factory=dict, metadata=LEFT_OUT)
-    """By role: the files that were given, in order; ``files`` has those beside a raster too (masks, world files)."""
     crs: str | None = None
     categorical: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
     ortho_bands: str | None = field(default=None, metadata=LEFT_OUT)

@@ -129,9 +129,8 @@ def _describe_inputs(options: BuildOptions, runs: Sequence[StoredRun], maps: Seq
 def _describe_run(run: StoredRun) -> RunInputs:
     log, tables = run.facts.log, run.facts.tables
     names = tuple(Path(path).name for path in log.paths)
-    named = {"logs": names, "segments_sha256": tables["segments.parquet"].sha256}
-    named |= {name: getattr(log, name) for name in ("sha256", "size_bytes", "parts")}
-    return convert_record(run.facts, RunInputs, **named)
+    segments = tables["segments.parquet"].sha256
+    return convert_record(run.facts, RunInputs, logs=names, sha256=log.sha256, segments_sha256=segments)
 
 
 def _refuse_without_segments(runs: Sequence[StoredRun]) -> None:

@@ -12,18 +12,17 @@ import pyarrow as pa
 from pyarrow.csv import write_csv
 
 from tcpipe.formats.atomic import write_text
+from tcpipe.formats.croissant import format_croissant
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     CARD,
     CLASSES,
     CROISSANT,
     EXCLUDED,
-    HUB_CARD,
     OVERVIEW,
     RELIEF,
     SAMPLES,
 )
-from tcpipe.formats.hub_card import format_croissant, format_hub_card
 from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.parquet import map_table, write_parquet_rows, write_pieces
@@ -71,7 +70,6 @@ def write_dataset(directory: Path, inputs: Inputs, options: BuildOptions, jobs: 
     card = make_dataset_card(figures, options, inputs, content, repeatability=repeatability, shards=shards)
     card = card if public is None else public.make_card(card)
     shutil.rmtree(waiting)
-    write_text(directory / HUB_CARD, format_hub_card(card))
     files = compute_checksums(directory)
     write_text(directory / CROISSANT, format_croissant(card, content.samples.schema, files))
     card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})

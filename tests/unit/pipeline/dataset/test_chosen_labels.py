@@ -94,7 +94,6 @@ def test_runs_without_power_give_the_samples_splits_and_times_of_runs_with_it(st
     assert result.card.labels == {"energy": 0, "time": 112, "slip": 112, "vibration": 112}
     (absent,) = select_findings(result.card.findings, "labels-absent")
     assert absent.names["labels"] == "energy"
-    assert "no label energy" in (tmp_path / "without" / "README.md").read_text()
     assert "none" in (tmp_path / "without" / "report.html").read_text()
     assert not verify(tmp_path / "without").problems
 

@@ -316,7 +316,3 @@ def test_the_line_that_publishes_it_is_printed_and_a_second_build_has_nothing_to
     how = {"store": here / "store", "split": here / "region.geojson", "file_format": "parquet"}
     how["covariates"] = here / "secretstation.csv"
     assert build_dataset(here / "public", without_coordinates=True, **how).status == "unchanged"
-    readme = (here / "public/README.md").read_text()
-    assert "origin that is not published" in readme
-    assert "overview.png" not in readme
-    assert "overview.png" in (here / "full/README.md").read_text()
