@@ -95,7 +95,7 @@ test-pages: .venv-pages/installed
 pictures: .venv-pages/installed
 	.venv-pages/bin/python docs/pictures.py
 
-# Changes of the rooms of numbers, one at a time: does a test notice? docs/explanation/mutants.md; an hour and more on one core.
+# Changes of the rooms of numbers, one at a time: does a test notice? docs/internals/tests.md; an hour and more on one core.
 # MUTANTS="--rooms motion path --draw 0" tries less.
 MUTANTS ?=
 .venv-mutants/installed: requirements-dev.lock pyproject.toml

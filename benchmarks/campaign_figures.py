@@ -1,4 +1,4 @@
-"""Figures of the campaign's cells, the verdict on each, and the page that shows them; docs/explanation/campaign.md says what they mean."""
+"""Figures of the campaign's cells, the verdict on each, and the page that shows them; docs/internals/tests.md says what they mean."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What faults leave behind, and hostile inputs cost; docs/explanation/faults.md says what is promised.
+"""What faults leave behind, and hostile inputs cost; docs/internals/faults.md says what is promised.
 
 ``python benchmarks/faults.py kills|signals|full-disk|services|together|faults|hostile|mutations|all``: every command that writes is
 broken at its steps (`fault_children`), at random moments, and by disks of several sizes; the object store and the cluster that it uses are

@@ -1,4 +1,4 @@
-"""What `tcpipe preflight` makes of a drive's first minute against what the whole drive gives: the table of docs/how-to/preflight.md.
+"""What `tcpipe preflight` makes of a drive's first minute against what the whole drive gives (docs/how-to/trust.md).
 
 python benchmarks/first_minute.py DIRECTORY [SCENARIO …]
 """

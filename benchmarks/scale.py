@@ -2,7 +2,7 @@
 
     python benchmarks/scale.py hours DIRECTORY [HOURS] [JOBS] [SCENARIO]   write that many hours of logs, and ingest them by one call
     python benchmarks/scale.py memory LOG [LOG ...]              the most memory that ingesting each log takes, and its CPU
-    python benchmarks/scale.py paper                             the second table of docs/explanation/scale.md, from the first
+    python benchmarks/scale.py paper                             the second table of docs/internals/performance.md, from the first
 
 One simulated drive of twelve minutes (or that of another scenario) is repeated, each time later, every measurement with noise of its own.
 CPU is that of the process and its workers, memory the largest of the calling process at any time.
@@ -201,7 +201,7 @@ def main(what: str, arguments: Sequence[str]) -> None:
     elif what == "memory":
         print_memory(arguments)
     else:
-        write_page(Path(__file__).parents[1] / "docs" / "explanation" / "scale.md")
+        write_page(Path(__file__).parents[1] / "docs" / "internals" / "performance.md")
 
 
 if __name__ == "__main__":

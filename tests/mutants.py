@@ -8,7 +8,7 @@ room run, to the first that fails. numba compiles nothing meanwhile, but in `COM
 
 Tried are all comparisons and numbers of `THOROUGH`, and of what else can be changed as many as ``--draw`` says, by seed. What is no
 change is left out: annotations, decorators, the bare ``*`` of a signature, and ``is`` for ``==``, which is a matter of the
-interpreter. Exit status 1: less than nine tenths were noticed. What lives on, and why it may, stands in docs/explanation/mutants.md.
+interpreter. Exit status 1: less than nine tenths were noticed. What lives on, and why it may, stands in docs/internals/tests.md.
 """
 
 from __future__ import annotations

@@ -12,5 +12,5 @@ def shared_data(name: str) -> Path:
     """Return the path of a third-party file, or skip the test with a reason."""
     path = _ROOT / name
     if not path.exists():
-        pytest.skip(f"third-party file {name} is not here (docs/reference/test-data.md says where it comes from)")
+        pytest.skip(f"third-party file {name} is not here (docs/internals/tests.md says where it comes from)")
     return path

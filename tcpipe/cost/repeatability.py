@@ -1,4 +1,4 @@
-"""How well labels repeat themselves where the robot drove the same ground twice in the same direction (ADR-19).
+"""How well labels repeat themselves where the robot drove the same ground twice in the same direction (docs/how-to/trust.md).
 
 A model that knows the ground alone cannot distinguish two passes. Two passes of one place and direction give
 s² = (r1 - r2)² / 2 of their residuals r; the mean over P pairs that share no sample is the variance of one pass. Its interval is a

@@ -240,7 +240,7 @@ class Rates:
 
 
 MEASURED = {INGEST: Rates(0.2e-6, 1.1, 0.7), BUILD: Rates(180e-6, 4_300.0, 1.5)}
-"""Rates measured on one core of 2025, for drives without a camera and patches of 40 px and three layers (docs/explanation/scale.md)."""
+"""Rates measured on one core of 2025, for drives without a camera and patches of 40 px and three layers (docs/internals/performance.md)."""
 
 
 @dataclass(frozen=True, slots=True)

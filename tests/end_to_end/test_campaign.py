@@ -1,4 +1,4 @@
-"""A quick part of the campaign (docs/explanation/campaign.md): no label is sure and wrong, whatever is wrong with the log."""
+"""A quick part of the campaign (docs/internals/tests.md): no label is sure and wrong, whatever is wrong with the log."""
 
 import sys
 from dataclasses import replace

@@ -351,10 +351,10 @@ def test_an_evaluation_takes_the_layers_of_the_model(models, tmp_path):
 
 
 def test_the_page_on_embeddings_runs_as_it_stands(site, tmp_path, monkeypatch):
-    """Its script and its commands, in order; one run is there, so that samples are held out instead of drives."""
-    page = (Path(__file__).parents[2] / "docs/how-to/own-layers.md").read_text()
-    script, commands = re.findall(r"^```(?:python)?\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
-    (tmp_path / "embed.py").write_text(script)
+    """The example and its commands, in order; one run is there, so that samples are held out instead of drives."""
+    docs = Path(__file__).parents[2] / "docs"
+    (commands,) = re.findall(r"^```\n(python embedding.*?)^```$", (docs / "how-to/train.md").read_text(), re.DOTALL | re.MULTILINE)
+    shutil.copy(docs / "examples/embedding.py", tmp_path)
     for name in ("height", "ortho", "terrain"):
         shutil.copy(site / f"{name}.tif", tmp_path)
     monkeypatch.chdir(tmp_path)

@@ -276,7 +276,7 @@ def test_an_estimate_is_what_the_like_took():
 def test_a_small_call_tells_little_of_a_million_samples():
     small = Call(command="build-dataset", version="0", counts={"samples": 312}, cpu_s=2.3, written_bytes=2_900_000)
     found = calls.estimate([small], "build-dataset", 1_000_000, jobs=1)
-    assert 100.0 < found.wall_s < 300.0, "185 s (docs/explanation/scale.md); 7,400 s in proportion"
+    assert 100.0 < found.wall_s < 300.0, "185 s (docs/internals/performance.md); 7,400 s in proportion"
     assert found.written_bytes < 5e9
     assert calls.estimate([small], "build-dataset", 312, jobs=8).wall_s == pytest.approx(1.5, abs=0.1)
 
