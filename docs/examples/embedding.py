@@ -8,10 +8,12 @@ from rasterio import Affine
 
 STEP = 5  # pixels of the orthophoto in one pixel of the embedding
 
+
 def encode(windows):
     """Your model: windows (N, STEP, STEP, 3) in [0, 1] to vectors (N, bands)."""
     texture = [np.abs(np.diff(windows, axis=axis)).mean(axis=(1, 2)) for axis in (1, 2)]
     return np.concatenate([windows.mean(axis=(1, 2)), windows.std(axis=(1, 2)), *texture], axis=1)
+
 
 source, target = sys.argv[1:]
 with rasterio.open(source) as ortho:

@@ -1,6 +1,6 @@
 """A run as a log of its own, to lie beside the recording in a viewer: track, segments, masked rows and rejections on the recorder's clock.
 
-ROS 2 messages in MCAP: Foxglove, Rerun and PlotJuggler all read them (docs/how-to/viewers.md). The fields of the messages are the tables' columns.
+ROS 2 messages in MCAP: Foxglove, Rerun and PlotJuggler all read them (docs/how-to/viewers.md). Their fields are the tables' columns.
 """
 
 from __future__ import annotations

@@ -303,7 +303,7 @@ class SplitConfig(_Section):
 
 @dataclass(frozen=True, slots=True)
 class CovariateConfig(_Section):
-    """How tables of weather, soil or snow are joined to the samples by time (`tcpipe build-dataset --covariates`)."""
+    """How tables of weather, soil or snow are joined to the samples by time (`tcpipe build-dataset --covariates FILE`)."""
 
     time_column: str | None = None
     """Column of the stamps; default: the only one named time, stamp, timestamp, date or datetime, with or without a unit."""

@@ -10,9 +10,9 @@ relative      bilinear        steps above the patch's       the same, in its ran
 ============  ==============  ============================  =======================================
 
 The paper has one of each: ortho O / 255, terrain (C - 1) / (c - 1), height (H - min H) / 1 m, all clipped to [0, 1]. A user's own rasters
-are continuous or categorical (docs/how-to/your-maps.md). A continuous one of several bands (an embedding) keeps its own pixel size in the map and in
-patches; each band is a channel of the tensor, scaled by its own range. A pixel without data in any layer is 0 in every channel, one
-without data in several bands in theirs; only a recipe with ``min_valid_fraction`` below 1 lets one in.
+are continuous or categorical (docs/how-to/your-maps.md). A continuous one of several bands (an embedding) keeps its own pixel size in the
+map and in patches; each band is a channel of the tensor, scaled by its own range. A pixel without data in any layer is 0 in every channel;
+one without data in several bands in theirs. Only a recipe with ``min_valid_fraction`` below 1 keeps such pixels.
 """
 
 from __future__ import annotations

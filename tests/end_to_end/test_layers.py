@@ -353,7 +353,9 @@ def test_an_evaluation_takes_the_layers_of_the_model(models, tmp_path):
 def test_the_page_on_embeddings_runs_as_it_stands(site, tmp_path, monkeypatch):
     """The example and its commands, in order; one run is there, so that samples are held out instead of drives."""
     docs = Path(__file__).parents[2] / "docs"
-    (commands,) = re.findall(r"^```\n(python embedding.*?)^```$", (docs / "how-to/train.md").read_text(), re.DOTALL | re.MULTILINE)
+    (commands,) = re.findall(
+        r"^```\n(python embedding.*?)^```$", (docs / "how-to/train.md").read_text(), re.DOTALL | re.MULTILINE
+    )
     shutil.copy(docs / "examples/embedding.py", tmp_path)
     for name in ("height", "ortho", "terrain"):
         shutil.copy(site / f"{name}.tif", tmp_path)
