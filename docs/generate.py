@@ -144,7 +144,8 @@ def _link_schemas(documents: Mapping[str, type]) -> str:
 
 _COLUMNS = f"""# Columns
 
-Data model {DATA_MODEL_VERSION}. After a column: type (double if not named), unit and frame; `?` allows null. Every file has them in its Arrow field metadata.
+Data model {DATA_MODEL_VERSION}. After a column: type (double if not named), unit and frame; `?` allows null.
+Every file has them in its Arrow field metadata.
 """
 
 
