@@ -10,7 +10,6 @@ from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.formats.maps.map_facts import Description, MapInputs
-from tcpipe.motion.distance_breakdown import Group
 from tcpipe.recipe import Recipe
 from tcpipe.tables.facts import EnergyBudget, Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import LEFT_OUT, Finding, Verdict, judge_by_code
@@ -302,14 +301,6 @@ class MapSource:
 
 
 @dataclass(frozen=True, slots=True)
-class Removal:
-    """Metres by class and by slope: driven, in samples, and removed by reason."""
-
-    by_class: tuple[Group, ...] = ()
-    by_slope: tuple[Group, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class Shard:
     """A Parquet file of patches: its path in the dataset, split and rows."""
 
@@ -357,7 +348,6 @@ class DatasetCard:
     split: SplitResult
     distance_by_reason_m: Mapping[str, float]
     """Distance breakdown of the runs [m]."""
-    removal: Removal
     repeatability: Mapping[str, Floor | None]
     """How well each label repeats itself; None where no place was driven twice."""
     runs: tuple[RunSource, ...]

@@ -117,7 +117,6 @@ def render_dataset_report(
                 "Distance breakdown",
                 "Used and excluded distances add up to the odometer.",
                 plots=[waterfall],
-                parts=_make_removal_sections(card),
             ),
             replace(make_repeatability_section(card.repeatability), parts=_make_class_sections(card)),
             _make_audit_section(card),
@@ -236,22 +235,6 @@ def _make_finding_sections(card: DatasetCard) -> list[Section]:
     ]
     text = "One line per code; the page of each run lists all of its findings."
     return [Section("Findings of ingest", text, header=("finding", "runs", "samples"), rows=rows)] if rows else []
-
-
-def _make_removal_sections(card: DatasetCard) -> list[Section]:
-    """Return how much of each class and slope is in samples; none where nothing was driven."""
-    sections = []
-    text = "If the shares differ, the exclusion depends on the ground (selection bias)."
-    for groups, what in ((card.removal.by_class, "class"), (card.removal.by_slope, "slope along travel")):
-        rows = []
-        for group in groups:
-            removed = ((name, metres) for name, metres in group.removed_m.items() if metres >= 0.5)
-            largest = sorted(removed, key=lambda item: (-item[1], item[0]))[:3]
-            reasons = ", ".join(f"{name.replace('_', ' ')} {metres:.0f}" for name, metres in largest)
-            rows.append((group.name, f"{group.driven_m:.0f}", f"{100 * group.used_share:.0f} %", reasons))
-        header = (what, "driven [m]", "in samples", "removed by [m]")
-        sections.append(Section(f"Metres in use by {what}", text, header=header, rows=rows))
-    return [section for section in sections if section.rows]
 
 
 def _make_class_sections(card: DatasetCard) -> list[Section]:

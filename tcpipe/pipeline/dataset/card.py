@@ -120,7 +120,6 @@ def make_dataset_card(
         energy_budget=pool_budgets(run.energy_budget for run in inputs.sources),
         split=content.split,
         distance_by_reason_m=content.distance_by_reason_m,
-        removal=content.removal,
         repeatability=repeatability,
         runs=runs,
         maps=tuple(map(_map_source, content.sources, inputs.made_from.maps.values(), content.registrations)),

@@ -24,7 +24,6 @@ from tcpipe.formats.dataset_card import (
     Covariate,
     Exclusion,
     MapRegistration,
-    Removal,
     RunSource,
     Shard,
     SplitResult,
@@ -50,7 +49,7 @@ from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.pipeline.dataset.inputs import Inputs
-from tcpipe.pipeline.dataset.map_checks import find_contradictions, find_removed_by_ground, register_runs
+from tcpipe.pipeline.dataset.map_checks import find_contradictions, find_driven_obstacles, register_runs
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import list_needs, move_losses, pool_segments
 from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
@@ -62,7 +61,7 @@ from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, hash_ranks
 from tcpipe.stages.sample import Sampled, place_segments, sum_losses
 from tcpipe.tables.bits import Loss, flag_name
 from tcpipe.tables.columns import make_points, read_lonlat_deg, to_floats, to_integers
-from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.terrain.layers import PAPER_CLASSES
 from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, parse_crs
@@ -184,7 +183,6 @@ class Content:
     exclusions: tuple[Exclusion, ...]
     excluded: pa.Table
     """Each id of these lists with its reason and outcome."""
-    removal: Removal
     findings: tuple[Finding, ...]
 
 
@@ -223,10 +221,9 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, jobs:
         slot, spool = np.zeros(segments.num_rows, np.int64), Spool(directory, {}, recipe.sample.patch_px)
     lost_m = sum_losses(to_floats(segments, "arc_length_m"), sampled.lost_by) if sources else {}
     if len(sampled.kept) == 0:
-        _, found = find_removed_by_ground(inputs.runs, segments, sampled.kept, sources, recipe, shifts=shifts)
         raise DatasetError(
             _describe_nothing_sampled(segments, lost_m, sources),
-            *map(format_finding, select_findings(found, "driven-not-traversable")),
+            *map(format_finding, find_driven_obstacles(segments, sources, recipe, shifts=shifts)),
             *_describe_uncertainty(segments, lost_m, inputs, recipe),
         )
     tags = read_tags(pc.unique(segments.column("run_id")).to_pylist(), inputs.sources, recipe.split)
@@ -249,11 +246,10 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, jobs:
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
     unused_m = {loss: arc_m[rows].sum() for loss, rows in unused.items()}
     shifted = [finding for _, findings in registered for finding in findings]
-    in_use = sampled.kept[~assigned.is_in("buffer", EXCLUDED)]
     flags, contradictions = np.zeros(len(sampled.kept), np.uint32), list[Finding]()
     if sources:
         flags, contradictions = find_contradictions(inputs.runs, segments, sampled, inputs.map_names, recipe.sample)
-    removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe, shifts=shifts)
+    obstacles = find_driven_obstacles(segments, sources, recipe, shifts=shifts)
     kept = np.flatnonzero(~assigned.is_in(EXCLUDED))
     order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
     added, covariates, incomplete = make_added_columns(
@@ -278,8 +274,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, jobs:
         covariates=covariates,
         exclusions=excluded.lists,
         excluded=excluded.ids,
-        removal=removal,
-        findings=(*found, *excluded.findings, *narrow, *biased, *incomplete),
+        findings=(*found, *excluded.findings, *narrow, *obstacles, *incomplete),
     )
 
 

@@ -1,4 +1,4 @@
-"""Runs against maps: the map's registration by heights, and the share of metres in samples by class and slope."""
+"""Runs against maps: the map's registration by heights, contradictions between map and track, and driven obstacles."""
 
 from __future__ import annotations
 
@@ -13,27 +13,16 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from tcpipe.errors import MapError
-from tcpipe.formats.dataset_card import MapRegistration, Removal
+from tcpipe.formats.dataset_card import MapRegistration
 from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.stored_runs import StoredRun
-from tcpipe.motion.distance_breakdown import (
-    Group,
-    compute_interval_length_m,
-    find_interval_reason,
-    find_main_reason,
-    find_uneven_groups,
-    list_groups,
-    sum_lengths_m,
-)
-from tcpipe.motion.row_sections import number_pieces
 from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.robust import estimate_shorth
 from tcpipe.stages.sample import Sampled, Shifts
-from tcpipe.tables.bits import DropReason, Quality, flag_name
-from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, read_threshold
-from tcpipe.terrain.layers import PAPER_CLASSES
+from tcpipe.tables.bits import Quality
+from tcpipe.tables.columns import read_lonlat_deg, to_floats
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.projection import Projection, compute_geoid_height
 from tcpipe.terrain.registration import (
     REACH_M,
@@ -44,29 +33,13 @@ from tcpipe.terrain.registration import (
     share_shift,
     thin_tracks,
 )
-from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at
+from tcpipe.terrain.sampling import find_classes_at
 from tcpipe.terrain.tiles import find_map_projection
 
 _COLUMNS = ["lon_deg", "lat_deg", "alt_m", "x_std_m", "y_std_m", "z_std_m"]
-_TRACK_COLUMNS = (
-    *("stamp_ns", "clock_epoch", "x_m", "y_m", "z_m", "east_velocity_mps", "north_velocity_mps", "up_velocity_mps"),
-    *("lon_deg", "lat_deg", "pitch_rad", "forward_velocity_mps", "dropped_by"),
-)
-_SLOPES_DEG = (-10.0, -5.0, -2.0, 2.0, 5.0, 10.0)
-_SLOPE_NAMES = ("below -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°", "2° to 5°", "5° to 10°", "above 10°")
-_REASONS = ("in_samples", *(flag_name(bit) for bit in DropReason), "curved_or_leftover", "not_sampled")
-"""Reason of each metre of a track; losses at sampling and to the split's buffer are one entry."""
-_LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
-
 _DATUM, _BLOCKED = "map-height-datum", "driven-not-traversable"
 _MOST_RUNS = 30
 """Registered together at most: more of them thin the points of each."""
-
-_Ground = tuple[MapFile, Projection, Shifts]
-"""A map, the projection of places onto it, and how far runs are moved there."""
-
-_Spans = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]
-"""Start and end [ns] of segments, in order, and whether each is used."""
 
 
 def register_runs(
@@ -329,112 +302,30 @@ def _find_clusters(rows: NDArray[np.int64], excess: _Rows, sampled: Sampled, map
         )  # fmt: skip
 
 
-def find_removed_by_ground(
-    runs: Sequence[StoredRun],
-    segments: pa.Table,
-    used: NDArray[np.int64],
-    sources: Sequence[MapFile],
-    recipe: Recipe,
-    *,
-    shifts: Sequence[Shifts],
-) -> tuple[Removal, tuple[Finding, ...]]:
-    """Return metres of all runs by reason, for each class and slope, and findings on uneven shares and on classes not traversable.
+def find_driven_obstacles(
+    segments: pa.Table, sources: Sequence[MapFile], recipe: Recipe, *, shifts: Sequence[Shifts]
+) -> list[Finding]:
+    """Return findings on classes that are not traversable, on which a large part of the segments lies.
 
-    ``used`` are the rows of ``segments`` that are train, test or unseen. Of overlapping ``sources`` the first counts; without a terrain
-    layer there are no classes. ``shifts`` are those of the runs, by map.
+    Of overlapping ``sources`` the first counts. ``shifts`` are those of the runs, by map.
     """
-    grounds = [
-        (source, find_map_projection(source, recipe.read.gnss_crs), moved)
-        for source, moved in zip(sources, shifts, strict=True)
-        if "terrain" in source.layers
-    ]
-    table = sources[0].classes if sources else PAPER_CLASSES
-    names = ["off the map", "no data", *table.names().tolist()[1:]]
-    spans, none = _list_spans(segments, used), np.empty(0, np.int64)
-    by_class, by_slope = np.zeros((len(names), len(_REASONS))), np.zeros((len(_SLOPE_NAMES), len(_REASONS)))
-    for run in runs:
-        length_m, reason, slope, ground = _read_intervals(
-            run, spans.get(run.run_id, (none, none, none.astype(np.bool_))), grounds
-        )
-        by_slope += sum_lengths_m(slope, reason, length_m, shape=by_slope.shape)
-        by_class += sum_lengths_m(ground - OFF_THE_MAP, reason, length_m, shape=by_class.shape)
-    slopes = list_groups(by_slope, _SLOPE_NAMES, _REASONS)
-    classes = list_groups(by_class, names, _REASONS) if grounds else ()
-    traversable = set(table.names()[table.traversable()].tolist())
-    findings = _find_bias([group for group in classes if group.name in traversable], "class")
-    blocked = _find_blocked(classes, grounds[0][0]) if grounds else []
-    return Removal(classes, slopes), (*blocked, *findings, *_find_bias(slopes, "slope"))
-
-
-def _find_blocked(groups: Sequence[Group], source: MapFile) -> list[Finding]:
-    """Return findings on classes that are not traversable, on which much of the distance was driven."""
-    closed = {entry.name: entry.id for entry in source.classes.classes if not entry.traversable}
-    driven_m, least = sum(group.driven_m for group in groups), read_threshold(_BLOCKED, "min_driven_fraction")
-    findings = []
-    for group in (group for group in groups if group.name in closed and group.driven_m > least * driven_m):
-        values = [str(value) for value, number in source.id_by_value.items() if number == closed[group.name]]
-        subject, names = Subject("class", group.name), {"values": ", ".join(values[:3])}
-        share = group.driven_m / driven_m
-        findings.append(make_finding(_BLOCKED, subject, names=names, driven_m=group.driven_m, driven_fraction=share))
-    return findings
-
-
-def _list_spans(segments: pa.Table, used: NDArray[np.int64]) -> dict[str, _Spans]:
-    """Return by run start and end of its segments, in order, and whether each is used."""
-    is_used = np.zeros(segments.num_rows, np.bool_)
-    is_used[used] = True
     runs = segments.column("run_id").combine_chunks().dictionary_encode()
-    code = runs.indices.to_numpy(zero_copy_only=False)
-    start, end = (to_integers(segments, f"{name}_ns") for name in ("start", "end"))
-    order = np.lexsort((start, code))
-    parts = np.split(order, np.searchsorted(code[order], np.arange(1, len(runs.dictionary))))
-    return {
-        run_id: (start[rows], end[rows], is_used[rows])
-        for run_id, rows in zip(runs.dictionary.to_pylist(), parts, strict=True)
-    }
-
-
-def _read_intervals(
-    run: StoredRun, spans: _Spans, grounds: Sequence[_Ground]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return length [m], reason, slope and class (ids as `find_classes_at`) of every interval of a run's track."""
-    track = run.table("track", _TRACK_COLUMNS)
-    stamp_ns, epoch = to_integers(track, "stamp_ns"), to_integers(track, "clock_epoch")
-    piece = number_pieces(stamp_ns, epoch, period_ns=1e9 / run.manifest.info.rate_hz)
-    position = np.column_stack([to_floats(track, f"{axis}_m") for axis in "xyz"])
-    velocity = np.column_stack([to_floats(track, f"{name}_velocity_mps") for name in ("east", "north", "up")])
-    length_m = compute_interval_length_m(stamp_ns, position, velocity, piece)
-    dropped = find_interval_reason(track["dropped_by"].to_numpy(), piece)
-    reason = np.where(dropped > 0, np.log2(np.maximum(dropped, 1)).astype(np.int64) + 1, _LEFT_OVER)
-    start, end, used = spans
-    middle = stamp_ns[:-1] + np.diff(stamp_ns) // 2
-    row = np.searchsorted(start, middle, side="right") - 1
-    inside = (row >= 0) & (dropped == 0)
-    inside[inside] = middle[inside] < end[row[inside]]
-    reason[inside] = np.where(used[row[inside]], 0, _NOT_SAMPLED)
-    uphill = -np.degrees(to_floats(track, "pitch_rad")) * np.sign(to_floats(track, "forward_velocity_mps"))
-    slope = np.searchsorted(_SLOPES_DEG, 0.5 * (uphill[1:] + uphill[:-1]))
-    lonlat = np.stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")], axis=1)
-    lonlat_deg = 0.5 * (lonlat[1:] + lonlat[:-1])
-    class_id = np.full(len(lonlat_deg), OFF_THE_MAP if grounds else 0, np.int64)
-    for source, projection, shifts in grounds:
-        unknown = class_id <= 0
-        moved_m = shifts.get(run.run_id, (0.0, 0.0, 0.0))[:2]
-        on_map = find_classes_at(source, projection.forward(lonlat_deg[unknown]) + moved_m)
-        class_id[unknown] = np.maximum(on_map, class_id[unknown])
-    return length_m, reason, slope, class_id
-
-
-def _find_bias(groups: Sequence[Group], kind: SubjectKind) -> list[Finding]:
-    driven_m, used_m = sum(group.driven_m for group in groups), sum(group.used_m for group in groups)
-    return [
-        make_finding(
-            "selection-bias",
-            Subject(kind, group.name),
-            names={"reason": find_main_reason(group) or "none"},
-            used_fraction=group.used_share,
-            driven_m=group.driven_m,
-            overall_fraction=used_m / driven_m,
-        )
-        for group in find_uneven_groups(groups)
-    ]
+    run, run_ids = runs.indices.to_numpy(zero_copy_only=False), runs.dictionary.to_pylist()
+    lonlat_deg = (read_lonlat_deg(segments, "start") + read_lonlat_deg(segments, "end")) / 2.0
+    length_m, class_id = to_floats(segments, "arc_length_m"), np.zeros(segments.num_rows, np.int64)
+    grounds = [(source, moved) for source, moved in zip(sources, shifts, strict=True) if "terrain" in source.layers]
+    for source, moved in grounds:
+        shift_m = np.array([moved.get(run_id, (0.0, 0.0, 0.0))[:2] for run_id in run_ids])
+        unknown = np.flatnonzero(class_id == 0)
+        xy_m = find_map_projection(source, recipe.read.gnss_crs).forward(lonlat_deg[unknown]) + shift_m[run[unknown]]
+        class_id[unknown] = np.maximum(find_classes_at(source, xy_m), 0)
+    findings, least = list[Finding](), read_threshold(_BLOCKED, "min_driven_fraction")
+    for entry in grounds[0][0].classes.classes if grounds else ():
+        driven_m = float(length_m[class_id == entry.id].sum())
+        if entry.traversable or driven_m <= least * length_m.sum():
+            continue
+        values = [str(value) for value, number in grounds[0][0].id_by_value.items() if number == entry.id]
+        subject, names = Subject("class", entry.name), {"values": ", ".join(values[:3])}
+        share = driven_m / float(length_m.sum())
+        findings.append(make_finding(_BLOCKED, subject, names=names, driven_m=driven_m, driven_fraction=share))
+    return findings

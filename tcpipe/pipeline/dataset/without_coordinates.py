@@ -42,7 +42,7 @@ _DOCS = {
 _KEPT_FIELDS = (
     "data_model_version", "tcpipe_version", "inputs", "name", "description", "licence", "creator", "samples", "robots", "splits",
     "folds_of_train", "terrain", "label_statistics_of_train", "patch_m", "patch_px", "layers", "tensor", "classes",
-    "energy_budget", "labels", "distance_by_reason_m", "removal", "repeatability", "flagged_samples", "physics", "added_columns", "shards",
+    "energy_budget", "labels", "distance_by_reason_m", "repeatability", "flagged_samples", "physics", "added_columns", "shards",
     "checksums",
 )  # fmt: skip
 """Fields of the card that are published as they are."""

@@ -190,7 +190,7 @@ def test_the_card_has_the_listed_fields_alone(built):
     assert not {"logs", "tags", "segments_sha256"} & {key for run in public["runs"] for key in run if run[key]}
     assert all(run["sha256"] == run["recipe_id"] == "" for run in public["runs"])
     assert public["label"].get("includes") is None
-    for name in ("samples", "splits", "folds_of_train", "terrain", "layers", "classes", "repeatability", "removal"):
+    for name in ("samples", "splits", "folds_of_train", "terrain", "layers", "classes", "repeatability"):
         assert public[name] == full[name], name
     for name in ("overview.png", "relief.png", "classes.png"):
         assert (here / "full" / name).exists()
