@@ -19,12 +19,11 @@ import pyarrow as pa
 from tcpipe.errors import LogError
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.logs.log_file import Log, OpenLog, find_autopilot, open_log
-from tcpipe.formats.logs.message_tables import TableLog, open_registered_log
+from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import (
     AUTOPILOT_SUFFIXES,
     Mappings,
-    find_reader,
     find_table_run,
     is_log_file,
     is_table,
@@ -155,14 +154,11 @@ def open_logs(
 def open_single_log(
     path: Path | str, *, message_definitions: Path | None = None, tables: Mappings | None = None
 ) -> Log | TableLog:
-    """Open a log of an autopilot or another package's reader; a folder that is no bag, or a table, by ``tables``; or as `open_log`."""
+    """Open a log of an autopilot; a folder that is no bag, or a table, by ``tables``; or as `open_log`."""
     with ExitStack() as stack:
         here, name = path, format_path(path)
-        reader = find_reader(name) if is_url(path) or Path(path).is_file() else None
-        if is_url(path) and (reader or name.lower().endswith(AUTOPILOT_SUFFIXES)):
+        if is_url(path) and name.lower().endswith(AUTOPILOT_SUFFIXES):
             here, _ = stack.enter_context(lay_out_objects(str(path), wanted=is_log_file, by_range=()))
-        if reader:
-            return open_registered_log(Path(here), reader, stack.pop_all())
         if not is_url(here) and (kind := find_autopilot(Path(here))):
             from tcpipe.formats.logs.autopilot_log import open_autopilot_log  # noqa: PLC0415  only where one is read
 

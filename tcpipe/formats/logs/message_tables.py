@@ -4,25 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.errors import LogError, clean_line
+from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import OpenLog, hash_files
 from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.tables.columns import make_text_column, number_column
 from tcpipe.tables.findings import Finding
 
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
-
-T = TypeVar("T")
 Fields = Mapping[str, "NDArray[np.generic] | pa.Array"]
 
 
@@ -108,37 +102,3 @@ def _make_column(values: NDArray[np.generic] | pa.Array) -> pa.Array:
     if values.ndim == 1:
         return number_column(values)
     return pa.FixedSizeListArray.from_arrays(number_column(values.ravel()), values.shape[1])
-
-
-def open_registered_log(path: Path, reader: EntryPoint, stack: ExitStack) -> TableLog:
-    """Read a file with the reader of another package; ``stack`` is closed with it. `LogError`: the reader fails."""
-    run = partial(_run_reader, path, reader)
-    topics = run(lambda: [_make_read_topic(*topic) for topic in reader.load()(path)])
-    topics = [replace(topic, make=partial(run, topic.make)) for topic in topics]
-    return TableLog(path, reader.name.lower(), topics, [path], stack=stack)
-
-
-def _run_reader(path: Path, reader: EntryPoint, call: Callable[[], T]) -> T:
-    """Return what a call into a reader returns; `LogError` with file, package and entry point if it raises another error."""
-    try:
-        return call()
-    except LogError:
-        raise
-    except Exception as error:
-        package = f"package {reader.dist.name if reader.dist else '?'}, entry point {reader.name} = {reader.value}"
-        cause = clean_line(f"{type(error).__name__}: {error}")
-        raise LogError(f"{path}: cannot be read by {package}: {cause}; correct or uninstall that package") from error
-
-
-def _make_read_topic(name: str, type_name: str, stamps: Sequence[int], read: Callable[[], Fields]) -> TopicMessages:
-    """Return a topic of a reader as `make_topic`; `ValueError`: its stamps are no rising numbers of nanoseconds."""
-    stamp_ns = np.asarray(stamps)
-    if stamp_ns.dtype != np.int64 or stamp_ns.ndim != 1 or not stamp_ns.size or (np.diff(stamp_ns) < 0).any():
-        got = f"{stamp_ns.dtype} of shape {stamp_ns.shape}"
-        raise ValueError(f"topic {name}: expected rising stamps [ns] as int64 of shape (N,), N > 0, got {got}")
-
-    def read_fields() -> Fields:
-        columns = {key: value if getattr(value, "ndim", 1) == 2 else pa.array(value) for key, value in read().items()}
-        return make_stamp_fields(stamp_ns) | columns
-
-    return make_topic(name, type_name, stamp_ns, read_fields)

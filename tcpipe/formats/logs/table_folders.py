@@ -7,17 +7,11 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from tcpipe.errors import LogError
 from tcpipe.formats.documents import parse_name
 from tcpipe.formats.logs.rosbag2 import METADATA
 from tcpipe.recipe import TableMapping
-
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tum", ".pos", ".parquet")
 """What a file of a table is called."""
@@ -138,26 +132,5 @@ def is_log_file(name: str) -> bool:
 
 
 def find_log_suffix(name: str) -> str:
-    """Return the suffix that makes a file a log, also that of a reader of another package; "" for other files."""
-    reader = find_reader(name)
-    ends = [f".{reader.name}"] if reader else [suffix for suffix in LOG_SUFFIXES if name.lower().endswith(suffix)]
-    return max(ends, key=len, default="")
-
-
-def find_reader(name: str) -> EntryPoint | None:
-    """Return another package's reader for a name with none of tcpipe's own suffixes; `LogError`: two packages have one."""
-    if name.lower().endswith(LOG_SUFFIXES) or is_table(name):
-        return None
-    found = [entry for entry in _list_readers() if name.lower().endswith(f".{entry.name.lower()}")]
-    if len(found) > 1:
-        packages = ", ".join(sorted(entry.dist.name if entry.dist else "?" for entry in found))
-        raise LogError(f"{name}: several packages read such a file: {packages}; uninstall all but one")
-    return found[0] if found else None
-
-
-@cache
-def _list_readers() -> tuple[EntryPoint, ...]:
-    """Return the readers that installed packages register: the name of an entry point is a suffix without its dot."""
-    from importlib.metadata import entry_points  # noqa: PLC0415  it searches all packages: only for foreign suffixes
-
-    return tuple(entry_points(group="tcpipe.logs"))
+    """Return the suffix that makes a file a log; "" for other files."""
+    return max((suffix for suffix in LOG_SUFFIXES if name.lower().endswith(suffix)), key=len, default="")

@@ -21,10 +21,9 @@ from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open
 from tcpipe.formats.maps.layer_building import Raster, RasterLayer, Tally, iterate_shards, open_raster
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
-from tcpipe.formats.maps.raster_commands import make_table_command
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
-from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.layers import (
     COLOURS,
     MAX_ID,
@@ -279,8 +278,7 @@ def _find_assumed(terrain: LayerSource | None) -> tuple[Finding, ...]:
     if not known:
         return ()
     names = {"meaning": ", ".join(known[:3]) + (" …" if known[3:] else "")}
-    remedy = Remedy("table", command=make_table_command(dict.fromkeys(values, "?")))
-    return (make_finding("classes-assumed", Subject("layer", "terrain"), names=names, remedies=[remedy]),)
+    return (make_finding("classes-assumed", Subject("layer", "terrain"), names=names),)
 
 
 def _make_facts(

@@ -37,7 +37,6 @@ from rasterio.windows import Window
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.maps.map_facts import read_value_names
-from tcpipe.formats.maps.raster_commands import describe_colours, suggest_bytes
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.layers import LUMA_RGB, MAX_BANDS
 from tcpipe.terrain.target_grid import MapGrid
@@ -100,9 +99,6 @@ _MAX_OPEN = 32
 
 _MAX_BLOCK_BYTES = 256_000_000
 """Largest block that is decoded at one time: a tile or a strip of a raster [byte]."""
-
-_LOOKED_AT_PX = 2048
-"""Longest side of a raster whose colours are counted [px]."""
 
 _MAX_STATISTICS_BYTES = 16_000_000
 
@@ -389,9 +385,8 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         rgb = [colours.get(colour) for colour in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
         palette = dataset.colorinterp[0] == ColorInterp.palette
         if not palette and any(kind not in {np.dtype(np.uint8), np.dtype(np.uint16)} for kind in kinds):
-            some = dataset.read(plain, out_shape=(len(plain), 512, 512), masked=True).compressed()
-            how = suggest_bytes(dataset.nodata, path, float(some[np.isfinite(some)].max(initial=0.0)) or 1.0)
-            raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, expected 8-bit or 16-bit unsigned; scale it: {how}")
+            expected = "8-bit or 16-bit unsigned; scale it to 1 to 255, with 0 for no data (rio calc)"
+            raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, expected {expected}")
         if None not in rgb:
             more = make_finding("ortho-bands-unused", subject, names={**file, "bands": names})
             return tuple(band for band in rgb if band is not None), (more,) if len(plain) > 3 else ()
@@ -406,7 +401,7 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         wanted = "one" if most == 1 else f"1 to {most} of one type"
         problem = f"{path}: {role} has {dataset.count} bands ({names[:80]}), expected {wanted}"
         has_colours = use == "classes" and len(plain) == 3 and kinds == {np.dtype(np.uint8)}
-        raise MapError(_describe_colours(dataset, path, plain) if has_colours else problem)
+        raise MapError(problem + " of class values; convert each colour to a value (rio calc)" * has_colours)
     kind = kinds.pop()
     wanted = "metres" if use == "metres" else "numbers"
     if use != "classes" and dataset.colorinterp[plain[0] - 1] == ColorInterp.palette:
@@ -417,16 +412,6 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
     if use == "classes" and kind.kind not in "iuf":
         raise MapError(f"{path}: {role} is {kind}, expected integer class values")
     return tuple(plain), ()
-
-
-def _describe_colours(dataset: Any, path: Path, bands: Sequence[int]) -> str:
-    """Return the problem that classes are shown by colours, with the commands that make each a value, and a table of them."""
-    shape = (3, min(dataset.height, _LOOKED_AT_PX), min(dataset.width, _LOOKED_AT_PX))
-    try:
-        red, green, blue = dataset.read(bands, out_shape=shape).astype(np.int64)
-    except RasterioError as error:
-        raise MapError(f"{path}: cannot be read; the file is damaged: {describe_error(error)}") from error
-    return describe_colours((red << 16) + (green << 8) + blue, path, bands)
 
 
 def _fits_half(dataset: Any, bands: tuple[int, ...], scale: tuple[float, float]) -> bool:

@@ -26,8 +26,7 @@ from tcpipe.formats.maps.geotiff import (
     read_tile,
     read_window,
 )
-from tcpipe.formats.maps.raster_commands import make_table_command, suggest_bytes, suggest_nodata
-from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.layers import ClassScheme, Layer, Pixels
 from tcpipe.terrain.projection import Projection, parse_crs
 from tcpipe.terrain.resampling import mean, resample_bilinear, resample_majority
@@ -335,8 +334,8 @@ class RasterLayer:
         values = ", ".join(f"{v} ({names[v]})" if v in names else str(v) for v in unnamed[:_LISTED])
         values += " …" if len(unnamed) > _LISTED else ""
         return (
-            f"{self.label}: none of its values {values} is in the class table (which names {named}); give one with {option}; "
-            f"this writes one to fill in: {make_table_command(dict.fromkeys(unnamed, '?'))}"
+            f"{self.label}: none of its values {values} is in the class table (which names {named}); "
+            f"give one (value,id,name,traversable) with {option}"
         )
 
     @property
@@ -359,26 +358,18 @@ class RasterLayer:
 
     def _find_isolated(self, subject: Subject) -> Iterator[Finding]:
         """Yield findings on values that are probably no data, and on a photo that uses little of 16 bits; white may be a collar."""
-        tiles, names = self.raster.tiles, {"file": self.name}
-        files = [self.raster.open_file(tile.path, tile.driver) for tile in tiles[:_NAMED]]
+        names = {"file": self.name}
         least = 0.0 if self.layer.kind == "relative" else read_threshold(_ISOLATED, "min_ortho_fraction")
         for sign, plateau in self.tally.plateaus.items():
             if plateau.is_isolated(least):
-                value, share = sign * plateau.value, plateau.counts[0] / plateau.total
-                commands = [
-                    "" if "palette" in tile.kind else suggest_nodata(file, tile.path, tile.scale, value)
-                    for file, tile in zip(files, tiles, strict=False)
-                ]
-                remedies = [Remedy("nodata", command=command) for command in commands if command]
-                named = names | {"value": f"{value:.6g}"}
-                yield make_finding(_ISOLATED, subject, names=named, remedies=remedies, pixel_fraction=share)
+                named = names | {"value": f"{sign * plateau.value:.6g}"}
+                share = plateau.counts[0] / plateau.total
+                yield make_finding(_ISOLATED, subject, names=named, pixel_fraction=share)
         counts = self.tally.by_class[1:255]
-        if self.layer.name == "ortho" and "uint16" in tiles[0].kind and counts.any():
+        if self.layer.name == "ortho" and "uint16" in self.raster.tiles[0].kind and counts.any():
             low, high = np.searchsorted(np.cumsum(counts) / counts.sum(), (_TAIL, 1.0 - _TAIL)).tolist()
             if (share := (high - low + 1) / 255.0) < read_threshold(_NARROW, "min_range_fraction"):
-                command = suggest_bytes(files[0].nodata, tiles[0].path, (high + 1.5) / tiles[0].scale[0])
-                remedies = [Remedy("scale", command=command)]
-                yield make_finding(_NARROW, subject, names=names, remedies=remedies, range_fraction=share)
+                yield make_finding(_NARROW, subject, names=names, range_fraction=share)
 
     def _compute_lattice(self, row0: int, col0: int, rows: int, cols: int) -> NDArray[np.float64]:
         return compute_source_lattice(self.grid, self.raster.georeference, self.projection, row0, rows, col0, cols)

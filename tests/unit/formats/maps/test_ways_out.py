@@ -111,35 +111,11 @@ def test_complex_numbers_are_one_line_with_a_command(tmp_path, dtype):
     assert np.unique(read_heights(build(tmp_path, height=tmp_path / "out.tif"))).tolist() == [601.0]
 
 
-@pytest.mark.parametrize("alpha", [False, True])
-def test_colours_become_classes_with_a_table_to_fill_in(tmp_path, site, alpha):
-    colours = {4: (0, 160, 0), 5: (120, 80, 20), 6: (200, 200, 120), 7: (90, 90, 90)}
+def test_colours_are_no_classes(tmp_path, site):
     with rasterio.open(site["terrain"]) as dataset:
-        ids = dataset.read(1)
-    bands = np.zeros((3, *ids.shape), np.uint8)
-    for number, colour in colours.items():
-        bands[:, ids == number] = np.array(colour, np.uint8)[:, None]
-    options = {"photometric": "RGB"}
-    if alpha:
-        bands, options = (
-            np.concatenate([bands, np.full((1, *ids.shape), 255, np.uint8)]),
-            {"photometric": "RGB", "alpha": "YES"},
-        )
-    terrain = write_tif(tmp_path / "rgb.tif", bands, WORLD.crs, TOP_LEFT, **options)
-    problem = refuse(tmp_path, height=site["height"], terrain=terrain)
-    run_rio(problem, tmp_path)
-    command = problem[problem.index("printf") : problem.index("; fill in")]
-    subprocess.run(["sh", "-c", command], cwd=tmp_path, check=True)
-    table = tmp_path / "classes.csv"
-    files = {"height": site["height"], "terrain": tmp_path / "classes.tif", "classes": table, "agreed": None}
-    with pytest.raises(MapError, match="traversable is missing"):
-        build(tmp_path, **files)
-    table.write_text(table.read_text().replace("?", "yes"))
-    source = build(tmp_path, **files)
-    found = read_layer(source, "terrain")
-    names = source.classes.names()[found]
-    for number, colour in colours.items():
-        assert set(names[ids == number].tolist()) == {"#" + bytes(colour).hex()}
+        bands = np.repeat(dataset.read(), 3, axis=0)
+    terrain = write_tif(tmp_path / "rgb.tif", bands, WORLD.crs, TOP_LEFT, photometric="RGB")
+    assert "convert each colour to a value" in refuse(tmp_path, height=site["height"], terrain=terrain)
 
 
 @pytest.mark.parametrize(
