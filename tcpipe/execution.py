@@ -45,7 +45,7 @@ _LONGEST_SAYING_BYTES = 3000
 
 @dataclass(frozen=True, slots=True)
 class Outcome(Generic[R]):
-    """What became of task ``index``: its result, or, when ``died``, nothing because its worker was killed."""
+    """Outcome of task ``index``: its result; None if its worker was killed (``died``)."""
 
     index: int
     result: R | None
@@ -219,9 +219,9 @@ def read_cluster_cpu_s() -> float:
 
 
 _ANSWER_S = 10
-"""So long a scheduler has to answer, and a cluster to have a worker."""
+"""Longest wait for an answer of a scheduler, and for the first worker of a cluster [s]."""
 _ALONE_S = 300
-"""So long a cluster may have lost all its workers."""
+"""Longest time for which a cluster may have no workers [s]."""
 _ADDRESS = re.compile(r"(tcp|tls)://[^/@]+:\d+")
 _AHEAD = 2
 """Tasks that a worker is handed at once: the next waits beside it."""
@@ -324,7 +324,7 @@ def _connect_client(address: str) -> Iterator[Client]:
 
 @contextmanager
 def _mute_loggers(*names: str) -> Iterator[None]:
-    """Silence loggers, which tell a lost connection by a traceback."""
+    """Silence loggers, which report a lost connection by a traceback."""
     levels = {name: logging.getLogger(name).level for name in names}
     try:
         for name in names:
@@ -336,7 +336,7 @@ def _mute_loggers(*names: str) -> Iterator[None]:
 
 
 def _count_workers(client: Client, address: str) -> int:
-    """Return the number of workers; `UsageError` where there is none, or one has several threads, no tcpipe, or another."""
+    """Return the number of workers; `UsageError` without any, or if one has several threads, no tcpipe or another version of it."""
     start = f"dask worker {address} --nthreads 1"
     try:
         client.wait_for_workers(1, timeout=_ANSWER_S)
@@ -360,7 +360,7 @@ def _make_cluster_error(worker: str, version: str, *, wanted: str) -> UsageError
 
 @dataclass(frozen=True, slots=True)
 class _Answer(Generic[R]):
-    """What a task gave, the CPU seconds that it took, and what it logged."""
+    """Result of a task, its CPU seconds, and its log records."""
 
     result: R
     cpu_s: float = 0.0

@@ -1,11 +1,11 @@
-"""The store: where runs and maps lie, in a directory or a bucket, as documents and the payload that they name (ADR-36).
+"""The store of runs and maps, in a directory or a bucket: documents, and the payload that they name (ADR-36).
 
 ::
 
     <root>/
       runs/ failed/ tags/ seen/ acknowledged/ maps/ outputs/ calls/     documents, see `tcpipe.formats.documents`
       blobs/<random>/          payload: the tables of a run (track, segments, rejections, streams/<role>), or a map
-      report.html              page of all runs; the page of a run lies beside its tables
+      report.html              page of all runs; the page of a run is in the folder of its tables
       index.parquet            cache of what the documents say
 """
 
@@ -109,7 +109,7 @@ class Store:
         return root / f"{record.name}.zarr", fetched
 
     def find_map(self, name: str, state: State | None = None) -> StoredMap:
-        """Return a map; `StoreError` if there is none of this name."""
+        """Return a map; `StoreError` without one of this name."""
         found = (self.scan() if state is None else state).maps.get(check_map_name(name))
         if found is None:
             raise StoreError(f"{self.root}: no map {name!r} in the store")
@@ -170,7 +170,7 @@ def check_map_name(name: str) -> str:
 
 
 def is_store(path: Path | str) -> bool:
-    """Return whether a place is a store: whether documents lie there. `UsageError` if it is one of tcpipe 1.x."""
+    """Return whether a place is a store: whether it has documents. `UsageError` if it is one of tcpipe 1.x."""
     if is_url(path) and not is_bucket(path):
         return False
     place = open_place(path)

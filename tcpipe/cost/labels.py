@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.power.noise import compute_median_period_s
-from tcpipe.power.rails import Rail, Samples, is_power_only
+from tcpipe.power.rails import Rail, SampledSignal, is_power_only
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.facts import CAUSES, EnergyBudget
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
@@ -234,11 +234,11 @@ def has_low_power_rate(rails: list[Rail]) -> bool:
     )
 
 
-def _is_slow(signal: Samples, each: Rail) -> bool:
+def _is_slow(signal: SampledSignal, each: Rail) -> bool:
     return is_too_slow(1.0 / compute_median_period_s(signal), averaged=each.averaged)
 
 
-def _is_varying(voltage: Samples) -> bool:
+def _is_varying(voltage: SampledSignal) -> bool:
     steps = np.diff(voltage.value)
     return steps.size > 0 and float(np.sqrt(np.mean(steps**2))) > _VOLTAGE_SHARE * abs(float(np.mean(voltage.value)))
 

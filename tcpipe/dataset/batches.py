@@ -33,7 +33,7 @@ _POOL_PIECES = 16
 
 
 class StoredPixels:
-    """Layers of N samples; ``rows`` says where each lies in the order of the files, (N,)."""
+    """Layers of N samples; ``rows`` are their places in the order of the files, (N,)."""
 
     def __init__(self, files: PatchFiles, rows: Ints) -> None:
         self.files = files

@@ -108,7 +108,7 @@ class TensorLayout:
     def form(self, pixels: Pixels, rows: NDArray[np.int64], mirrored: NDArray[np.bool_] | None = None) -> Floats:
         """Return the tensor of ``rows``, shape (B,), of stored layers: float32, shape (B, px, px, depth).
 
-        ``mirrored`` tells which of them are mirrored across their direction of travel, shape (B,).
+        ``mirrored`` marks those that are mirrored across their direction of travel, shape (B,).
         """
         flips = np.zeros(len(rows), np.bool_) if mirrored is None else mirrored
         px = self.patch_px

@@ -1,10 +1,10 @@
 """Outputs appear whole or not at all: written under a temporary name beside their place, synced, then renamed.
 
-A temporary lies in a *holder* beside its place, ``.tmp-<name of the place>-<8 hex>``, that is locked as long as its writer lives. So what
-a killed process left behind is told from what another one is writing. One rule for all of it: whoever writes into a directory, or looks
-whether there is something to do in it, clears it first (`clear`). What a kill took away from its place comes back then, the rest goes.
+A temporary is in a *holder* beside its place, ``.tmp-<name of the place>-<8 hex>``, which its writer locks. An unlocked holder is that of
+a killed process. Each writer into a directory first clears it (`clear`): an output that was moved aside returns, all other temporaries are
+removed.
 
-Paths that a user gives: what is read is there, what is written lies on this machine; else nothing begins (exit code 2).
+This module also checks paths of users: inputs must exist, outputs must be on this machine (else exit code 2).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pathlib import Path
 from tcpipe.errors import StoreError, UsageError
 
 TEMPORARY_PREFIX = ".tmp-"
-"""What is left behind by a killed process begins with this; readers skip it."""
+"""Prefix of the names of temporaries; readers skip them."""
 
 _HOLDER = re.compile(re.escape(TEMPORARY_PREFIX) + r"(.+)-[0-9a-f]{8}", re.DOTALL)
 _LONGEST_NAME = 200
@@ -106,7 +106,7 @@ def make_working_directory(staging: Path) -> Iterator[Path]:
 
 @contextmanager
 def make_scratch_directory() -> Iterator[Path]:
-    """Yield an empty directory of this user in the system's own (``TMPDIR``); what killed processes left there goes first."""
+    """Yield an empty directory of this user in the system's own (``TMPDIR``); temporaries of killed processes there are removed before."""
     clear_scratch()
     holder, lock = _make_locked_directory(Path(tempfile.gettempdir()), _make_scratch_prefix(), mode=0o700)
     try:
@@ -163,7 +163,7 @@ def _sync_files(directory: Path) -> None:
 
 @contextmanager
 def lock_directory(directory: Path) -> Iterator[None]:
-    """Let one process at a time through, by a lock on ``directory``; where the file system has no locks, all."""
+    """Admit one process at a time by a lock on ``directory``; all, if the file system has no locks."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         with suppress(OSError):
@@ -276,7 +276,7 @@ def find_leftovers(path: Path) -> list[Path]:
 
 
 def is_abandoned(holder: Path) -> bool:
-    """Return whether nobody writes into a temporary any more; it may be removed then."""
+    """Return whether the writer of a temporary has ended, so that it may be removed."""
     return _remove_if_abandoned(holder, lambda: None)
 
 

@@ -20,13 +20,13 @@ _MOST_BYTES = 8_000_000_000
 _SHARE_UNSEEN = 64
 """A process may exceed the limit by one part in so many before it looks at all files of the cache again, which takes time."""
 _unseen_bytes = [float("inf")]
-"""What this process has added since it last looked; infinite before it has looked."""
+"""Bytes that this process has added since it last listed the cache; infinite before the first list."""
 _IN_USE_S = 60.0
 """A file that was used within this time stays: another process may be about to open it."""
 
 
 def fetch_cached(key: str, fetch: Callable[[Path], object]) -> Path:
-    """Return the file of a key; where there is none, ``fetch`` writes it. `StoreError`: the cache cannot be written."""
+    """Return the file of a key; ``fetch`` writes it if it does not exist. `StoreError`: the cache cannot be written."""
     path = _find_cache_path(key)
     if _is_there(path):
         return path

@@ -86,7 +86,7 @@ class DatasetInputs:
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class RecordChange:
     """One entry of a record that differs from another's."""
 
     path: tuple[str, ...]
@@ -102,17 +102,17 @@ class Change:
         return ".".join(self.path[1:])
 
 
-def compare_records(was: DatasetInputs, now: DatasetInputs) -> Iterator[Change]:
+def compare_records(was: DatasetInputs, now: DatasetInputs) -> Iterator[RecordChange]:
     """Yield every entry in which two records differ, in the order of their fields."""
     yield from _compare((), to_plain(was), to_plain(now))
 
 
-def _compare(path: tuple[str, ...], was: Json, now: Json) -> Iterator[Change]:
+def _compare(path: tuple[str, ...], was: Json, now: Json) -> Iterator[RecordChange]:
     if isinstance(was, Mapping) and isinstance(now, Mapping):
         for key in dict.fromkeys((*was, *now)):
             yield from _compare((*path, key), was.get(key), now.get(key))
     elif was != now:
-        yield Change(path, was, now)
+        yield RecordChange(path, was, now)
 
 
 _LONGEST_VALUE = 80

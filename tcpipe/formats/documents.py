@@ -34,7 +34,7 @@ from tcpipe.formats.integrity import compute_short_digest
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json, to_json
 from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
-from tcpipe.formats.runs import Call, Failure, LogSnapshot, Output, Problem, RunFacts, StoredMap, Tags, find_lineage
+from tcpipe.formats.runs import Call, LogFailure, LogSnapshot, Output, Problem, RunFacts, StoredMap, Tags, find_lineage
 from tcpipe.tables.findings import Subject, make_finding
 
 logger = logging.getLogger("tcpipe")
@@ -44,9 +44,9 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 """In the order in which they are listed: calls first, so that a call that ends later is seen as open."""
 BLOBS = "blobs"
 INDEX = "index.parquet"
-Record: TypeAlias = Call | RunFacts | Failure | Tags | LogSnapshot | Problem | StoredMap | Output
+Record: TypeAlias = Call | RunFacts | LogFailure | Tags | LogSnapshot | Problem | StoredMap | Output
 RECORDS: Mapping[Kind, type[Record]] = {
-    "calls": Call, "runs": RunFacts, "failed": Failure, "tags": Tags, "seen": LogSnapshot, "acknowledged": Problem, "maps": StoredMap,
+    "calls": Call, "runs": RunFacts, "failed": LogFailure, "tags": Tags, "seen": LogSnapshot, "acknowledged": Problem, "maps": StoredMap,
     "outputs": Output,
 }  # fmt: skip
 _NAME = re.compile(r"([0-9a-f]{16})\.([0-9]{1,9})\.([0-9a-f]{16})\.json")
@@ -118,7 +118,7 @@ class State:
         return self._joined
 
     @property
-    def failed(self) -> dict[str, Failure]:
+    def failed(self) -> dict[str, LogFailure]:
         """Failures by key."""
         return self.facts["failed"]
 

@@ -28,14 +28,14 @@ _SEAL_LINE = re.compile(rb'^  "document_sha256": "([0-9a-f]{64})"(,?)\n', re.MUL
 """The seal in canonical JSON: the text without this line is what it is the hash of."""
 
 ALL_CHANGES = "; 'tcpipe verify {}' lists all changed files"
-"""What a line about one of them ends with."""
+"""End of a message on one changed file."""
 
 _PAGE_SEAL = "<!-- sha256 of the lines above: {} -->\n"
 
 
 @dataclass(frozen=True, slots=True)
 class Checksum:
-    """What a sealed document has of a file."""
+    """Size and hash of a file in a sealed document."""
 
     size_bytes: int
     sha256: str

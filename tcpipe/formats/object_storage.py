@@ -47,7 +47,7 @@ _MAX_RETRIES = 10_000
 _DENIED = (
     "169.254.169.254", "Account must be specified", "401 Unauthorized", "403 Forbidden", "Missing AccessKeyId", "Missing SecretAccessKey"
 )  # fmt: skip
-"""What is said where credentials are not set (a cloud machine's own are asked for, in vain), or wrong."""
+"""Messages of the libraries if credentials are missing (also those of a cloud machine) or wrong."""
 _NO_ANSWER = {
     "ConnectionRefused": "connection refused",
     "dns error": "the name of the host is not known",
@@ -56,7 +56,7 @@ _NO_ANSWER = {
     "kind: Timeout": "no answer in time",
     "TimedOut": "no answer in time",
 }
-"""What obstore has of a broken connection, and how it is told."""
+"""Texts of obstore on a broken connection, and the message for each."""
 _CODE = re.compile(r"<Code>(\w+)</Code>")
 _STATUS = re.compile(r"\b([45]\d\d) [A-Z][A-Za-z ]*(?=: )")
 _ADDRESS = re.compile(r"https?://(?:[^\s/@]*@)?[^\s/?)]+")
@@ -83,7 +83,7 @@ class StoredObject:
     bucket: str
     """Or directory or server."""
     query: str
-    """Of a presigned URL."""
+    """Parameters of the query of a presigned URL."""
     name: str
     size_bytes: int
     modified_ns: int
@@ -140,7 +140,7 @@ def make_absolute(place: str | Path) -> str:
 
 
 def is_bucket(text: str | Path) -> bool:
-    """Return whether a text is the URL of what lies in a bucket, which can be listed and written."""
+    """Return whether a text is a URL in a bucket, which can be listed and written."""
     return str(text).rstrip("/").startswith(("s3://", "gs://", "az://"))
 
 
@@ -167,7 +167,7 @@ def format_path(path: str | Path) -> str:
 
 
 def is_presigned(path: str | Path) -> bool:
-    """Return whether this is a URL with a query: nobody can look there again without it."""
+    """Return whether this is a URL with a query, without which it cannot be read again."""
     return is_url(path) and bool(split_url(str(path), one_object=True)[1])
 
 
@@ -432,7 +432,7 @@ def _read_retry_minutes() -> float:
 
 
 def _iterate_objects(store: ObjectStore, url: str, query: str, wanted: Callable[[str], bool]) -> Iterator[StoredObject]:
-    """Yield the object of a name; where there is none, what is wanted below it."""
+    """Yield the object of a name; without one, the wanted objects below it."""
     name = split_bucket(url)[1]
     if query:  # presigned for one object and method: neither HEAD nor a list is allowed
         if name:
@@ -458,7 +458,7 @@ def _make_stored_object(url: str, query: str, name: str, meta: ObjectMeta) -> St
 
 
 def read_modified_ns(meta: ObjectMeta) -> int:
-    """Return when an object was written [ns since 1970]; stores tell microseconds at most."""
+    """Return when an object was written [ns since 1970]; stores have microseconds at most."""
     return round(meta["last_modified"].timestamp() * 1e6) * 1000
 
 

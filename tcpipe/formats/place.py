@@ -52,7 +52,7 @@ def is_desktop_file(name: str) -> bool:
     return name.rpartition("/")[2] in _DESKTOP_FILES or name.endswith(_STATISTICS)
 
 
-class Entry(NamedTuple):
+class FileEntry(NamedTuple):
     """A file at a place: its name there, its size [byte], and its modification time [ns] by the clock of the disk or bucket."""
 
     name: str
@@ -147,13 +147,13 @@ class Place:
             return sorted(name for name in names if not name.startswith(atomic.TEMPORARY_PREFIX))
         return []
 
-    def entries(self, prefix: str = "") -> _List[Entry]:
+    def entries(self, prefix: str = "") -> _List[FileEntry]:
         """Return all files below ``prefix/``, however deep, sorted by name, without temporaries; a bucket lists 1000 per request."""
 
-        def list_objects(store: ObjectStore, key: str) -> _List[Entry]:
+        def list_objects(store: ObjectStore, key: str) -> _List[FileEntry]:
             cut = len(self._key("x")) - 1
             found = (meta for batch in store.list(key or None) for meta in batch)
-            return sorted(Entry(meta["path"][cut:], meta["size"], read_modified_ns(meta)) for meta in found)
+            return sorted(FileEntry(meta["path"][cut:], meta["size"], read_modified_ns(meta)) for meta in found)
 
         above = f"{prefix}/" if prefix else ""
         return self._do(prefix, lambda path: sorted(_walk_files(str(path), above)), list_objects)
@@ -247,7 +247,7 @@ def open_place(path: str | Path) -> Place:
     return Place(split_url(str(path))[0].rstrip("/") if is_url(path) else Path(path))
 
 
-def _walk_files(directory: str, above: str) -> Iterator[Entry]:
+def _walk_files(directory: str, above: str) -> Iterator[FileEntry]:
     """Yield the files below a directory, ``above`` before their names; a file that is removed meanwhile is skipped."""
     with suppress(FileNotFoundError, NotADirectoryError), os.scandir(directory) as there:
         for entry in there:
@@ -258,7 +258,7 @@ def _walk_files(directory: str, above: str) -> Iterator[Entry]:
                 continue
             with suppress(FileNotFoundError):
                 seen = entry.stat()
-                yield Entry(above + entry.name, seen.st_size, seen.st_mtime_ns)
+                yield FileEntry(above + entry.name, seen.st_size, seen.st_mtime_ns)
 
 
 _READS_AT_ONCE = 4

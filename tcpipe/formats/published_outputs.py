@@ -29,7 +29,7 @@ from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.integrity import Checksum, Checksums, compute_short_digest
 from tcpipe.formats.json_files import parse_json, parse_typed, parse_typed_json, to_json
 from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.place import REPORT, Entry, Place, find_changed_files, open_place
+from tcpipe.formats.place import REPORT, FileEntry, Place, find_changed_files, open_place
 
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents with the checksums of all files beside them."""
@@ -163,7 +163,7 @@ def _iterate_pointers(place: Place, names: Iterable[str]) -> Iterator[_Pointer]:
             yield replace(parse_typed_json(data, _Pointer, place.where(match[0])), name=match[0])
 
 
-def _find_expired(entries: Sequence[Entry], pointers: Sequence[_Pointer]) -> list[str]:
+def _find_expired(entries: Sequence[FileEntry], pointers: Sequence[_Pointer]) -> list[str]:
     """Return pointers and folders that have not been in use for seven days; the bucket's own times of modification decide."""
     if not pointers:
         return []

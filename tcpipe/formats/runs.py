@@ -42,7 +42,7 @@ class LogSnapshot:
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class LogFailure:
     """A log that failed because of its content: the same call would fail again."""
 
     content: str

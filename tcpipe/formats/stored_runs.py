@@ -16,7 +16,7 @@ from tcpipe.errors import StoreError, TableError
 from tcpipe.formats.documents import BLOBS, State, read_record
 from tcpipe.formats.json_files import parse_typed, to_plain
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.place import REPORT, Entry, Place, is_desktop_file
+from tcpipe.formats.place import REPORT, FileEntry, Place, is_desktop_file
 from tcpipe.formats.runs import Run, RunFacts, StoredMap, StreamInfo, restore_repeated
 from tcpipe.tables.levels import TABLES_VERSION, MaskedTrack, Streams, add_metadata, read_metadata
 
@@ -190,9 +190,9 @@ class Unnamed(NamedTuple):
     """The first file that tcpipe did not write."""
 
 
-def list_payload(place: Place) -> dict[str, list[Entry]]:
+def list_payload(place: Place) -> dict[str, list[FileEntry]]:
     """Return the files of each folder of payload, by their names in it."""
-    found: dict[str, list[Entry]] = {name: [] for name in place.list(BLOBS) if BLOB.fullmatch(name)}
+    found: dict[str, list[FileEntry]] = {name: [] for name in place.list(BLOBS) if BLOB.fullmatch(name)}
     for entry in place.entries(BLOBS):
         blob, _, name = entry.name.removeprefix(f"{BLOBS}/").partition("/")
         if BLOB.fullmatch(blob) and name:
@@ -212,7 +212,7 @@ def list_named_files(records: Iterable[RunFacts | StoredMap]) -> set[str]:
     return named
 
 
-def find_unnamed(payload: Mapping[str, Sequence[Entry]], named: Collection[str]) -> Iterator[Unnamed]:
+def find_unnamed(payload: Mapping[str, Sequence[FileEntry]], named: Collection[str]) -> Iterator[Unnamed]:
     """Yield what is not named: whole folders, and single files of folders in use."""
     used = {name.partition("/")[0] for name in named}
     for blob, entries in payload.items():

@@ -77,7 +77,7 @@ class TopicTimes:
 
 
 @dataclass(frozen=True, slots=True)
-class Timeline:
+class TopicTimeline:
     """A topic's rows in the order they were measured.
 
     ``row`` points into the topic's rows; (``epoch``, ``stamp_ns``) increases strictly. ``why`` is a reason in kebab case.
@@ -130,7 +130,7 @@ class SimulatedClock:
 class AlignedClocks:
     """Each topic's timeline, the clock steps that divide them into epochs, and the simulation's clock where that rules."""
 
-    timelines: dict[str, Timeline]
+    timelines: dict[str, TopicTimeline]
     steps: list[ClockStep]
     simulated: SimulatedClock | None = None
 
@@ -246,7 +246,7 @@ def _settle_steps(topics: Mapping[str, TopicTimes], of_host: Sequence[ClockStep]
     )
 
 
-def _make_simulated_timeline(name: str, times: TopicTimes, clock: SimulatedClock) -> Timeline:
+def _make_simulated_timeline(name: str, times: TopicTimes, clock: SimulatedClock) -> TopicTimeline:
     """Return the timeline of a topic in a simulation: by its header, or by the simulation's time when it was received."""
     known, epoch = _is_set(times), np.zeros(len(times.log_time_ns), np.int64)
     median, every = _compute_median_offset(times, known), np.ones(len(epoch), bool)
@@ -477,7 +477,7 @@ def _find_clock_shifts(times: TopicTimes, draft: _Draft, reference: Sequence[int
     return [move if abs(move) > APART_NS and times.prefer != "header" else 0 for move in apart]
 
 
-def _make_timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> Timeline:
+def _make_timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> TopicTimeline:
     stamps = draft.stamp_ns + np.array(moves, np.int64)[draft.clock_epoch] + times.offset_ns
     late = _compute_lateness(stamps, draft.clock_epoch, draft.usable)
     keep = draft.usable & (late < LATE_NS)
@@ -496,7 +496,7 @@ def _make_timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> Ti
     }
     notes = {"sorted": int(np.count_nonzero(keep & (late > 0))), "stamps_replaced": draft.replaced}
     chosen = order[~again]
-    return Timeline(
+    return TopicTimeline(
         chosen,
         stamps[chosen],
         draft.clock_epoch[chosen].astype(np.int16),

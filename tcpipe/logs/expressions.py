@@ -113,7 +113,7 @@ class Expression:
 
 
 def parse_expression(text: str, known: Collection[str] = ()) -> Expression:
-    """Return the expression of a text; one that is a ``known`` column's name is that column. `ExpressionError`: it is none."""
+    """Return the expression of a text; one that is a ``known`` column's name is that column. `ExpressionError`: another text."""
     quoted = (text,) if text in known else tuple(_QUOTED.findall(text))
     marks = (f"{_MARK}{number}" for number in range(len(quoted)))
     source = next(marks) if text in known else _QUOTED.sub(lambda _: next(marks), text.strip())
@@ -139,7 +139,7 @@ UNITS: dict[str, dict[str, float]] = {
     "J": {"J": 1.0, "kJ": 1000.0, "mWh": 3.6, "Wh": 3600.0, "kWh": 3.6e6},
     "1": {"1": 1.0},
 }
-"""What one of a unit is in another: that by which they are grouped."""
+"""Factor from each unit to the unit by which they are grouped."""
 
 _UNIT_NAMES = """
 deg degree degrees °; rad radian radians; m meter meters metre metres; cm; mm; km; ft feet;
@@ -160,9 +160,9 @@ def simplify_name(name: str) -> str:
 
 
 def split_unit(name: str) -> tuple[str, str | None, bool]:
-    """Return a column's name without the unit that it ends with, that unit, and whether it stands in brackets.
+    """Return a column's name without the unit at its end, that unit, and whether it is in brackets.
 
-    ``lat (deg)``, ``Power [w]`` and ``speed_kmh`` state one. In brackets it is what stands there where that is no unit that is known.
+    ``lat (deg)``, ``Power [w]`` and ``speed_kmh`` state one. A text in brackets that is no known unit is returned as it is.
     """
     opening = max(name.rfind("("), name.rfind("["))
     if opening > 0 and name.rstrip().endswith((")", "]")):

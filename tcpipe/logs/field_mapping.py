@@ -1,8 +1,7 @@
-"""What the recipe says of columns and of message types that are not known: their fields as those of the message a role usually has.
+"""Mapping of columns and of fields of custom message types to the fields of the message that a role usually has.
 
-One mapping serves tables (`[tables.<role>]`) and custom messages (`[read.fields]`): the fields here by their short names, each in its unit.
-
-Which field of a role a column is, or a field of somebody's own message type, by what it is called.
+One mapping serves tables (`[tables.<role>]`) and custom messages (`[read.fields]`): the fields by their short names, each in its unit.
+Names of columns and fields propose the mapping.
 """
 
 from __future__ import annotations
@@ -122,7 +121,7 @@ MAPPED_TYPES = {
 """The message as which a role's fields are read."""
 
 STAMP_UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
-"""What one of a unit of stamps is in [ns]."""
+"""Nanoseconds of one unit of stamps [ns]."""
 YEARS_S = (3e8, 1e10)
 """Seconds since 1970 from 1979 to 2286: they identify the unit of a stamp."""
 _LEAPS = ((1_341_100_800, 16), (1_435_708_800, 17), (1_483_228_800, 18))
@@ -152,7 +151,7 @@ def find_mapping_problems(
 
 @dataclass(frozen=True, slots=True)
 class FieldSource:
-    """What a field is made of: an expression, times a factor to its unit; of a fix quality what its codes are."""
+    """Source of a field: an expression, times a factor to its unit; of a fix quality the kind of its codes."""
 
     expression: Expression
     factor: float
@@ -274,7 +273,7 @@ def _collect_other_fields(role: str, values: Mapping[str, Floats], made: Columns
 
 
 def find_topic(name: str, role: str, columns: Collection[str], power_type: str | None) -> tuple[str, str]:
-    """Return the topic and message type as which a table is read: a voltage or a current alone is a bare number, told by the name.
+    """Return the topic and message type as which a table is read: a voltage or a current alone is a bare number, identified by its name.
 
     ``power_type`` is that of a source that the recipe makes of the table.
     """
@@ -287,9 +286,9 @@ def find_topic(name: str, role: str, columns: Collection[str], power_type: str |
 
 
 def parse_stamps_ns(values: Array, unit: str) -> NDArray[np.int64] | str:
-    """Return finite numbers, shape (N,), as [ns], or what is in the way of that in words.
+    """Return finite numbers, shape (N,), as [ns], or why they are no stamps.
 
-    ``unit`` is s, ms, us or ns; auto tells it by their size, since 1979.
+    ``unit`` is s, ms, us or ns; auto infers it from their size, since 1979.
     """
     if unit == "auto":
         middle = float(np.median(values)) if values.size else 0.0
@@ -389,7 +388,7 @@ CALLED: Mapping[str, Mapping[str, str]] = {
         "z": r"[tp]?z|pos(ition)?[_.]?z|up|height",
     },
 }
-"""What is called how, as patterns of names in lower case without a unit; the likelier role first."""
+"""Patterns of names of each field, in lower case without a unit; the likelier role first."""
 
 _DEEPEST = 4
 _LONGEST_BYTES, _MOST_NAMES = 1 << 16, 1000

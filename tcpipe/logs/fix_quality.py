@@ -53,7 +53,7 @@ CODES_OF_NAMES = {
     "ublox": r"(.*[_.])?carr(ier)?_?sol\w*",
     "gga": r"(.*[_.])?(gga|fix|gps)_?qual(ity)?",
 }
-"""What a column is called whose name says what its codes are, as patterns in lower case."""
+"""Patterns of names, in lower case, of columns whose names state the kind of their codes."""
 _EQUAL_FEWEST = 20
 
 
@@ -79,7 +79,7 @@ def find_quality(names: Iterable[str]) -> list[str]:
 
 
 def classify_fixes(values: Array, codes: str) -> Floats:
-    """Return the quality of each fix by its code or word, shape (N,): NaN where it is not known, negative where there is none."""
+    """Return the quality of each fix by its code or word, shape (N,): NaN if unknown, negative without a fix."""
     found = np.full(len(values), _NO_FIX)
     if np.issubdtype(values.dtype, np.number):
         for code, quality in CODES[codes].items():

@@ -176,7 +176,7 @@ _UNMEASURED_VAR = 1e3
 def _find_unmeasured(columns: Columns, name: str, twist: Floats) -> Mask:
     """Return which components of a twist (N, 6) are no measurements: variance -1 or vast, or zero throughout while the robot moves.
 
-    Velocity ahead is left to its variance. A constant is told from a calm sensor by its last digit, and only in some rows.
+    Forward velocity keeps its variance. The last digit distinguishes a constant from a calm sensor, only in some rows.
     """
     found = np.zeros(twist.shape, bool)
     if name in columns and columns[name].shape[1] >= 36:

@@ -51,10 +51,10 @@ class Gga:
 
 @dataclass(frozen=True, slots=True)
 class OverGround:
-    """Sentences that tell speed and course, as `Gga`.
+    """Sentences with speed and course, as `Gga`.
 
-    ``time_of_day_ns`` is -1 where there is none (VTG); ``course_rad`` clockwise from true north; ``status`` is -1 where the receiver does
-    not stand for it.
+    ``time_of_day_ns`` is -1 without a time (VTG); ``course_rad`` clockwise from true north; ``status`` is -1 if the receiver marks the
+    sentence as not valid.
     """
 
     row: Ints
@@ -72,7 +72,7 @@ def read_gga(sentences: Sequence[str]) -> Gga:
 
 
 def read_over_ground(sentences: Sequence[str]) -> OverGround:
-    """Return the RMC sentences, which have a time, or where there are none the VTG sentences."""
+    """Return the RMC sentences, which have a time; without any, the VTG sentences."""
     has_rmc = any(_SENTENCES["RMC"].search(text) for text in sentences)
     kind, parse = ("RMC", _parse_rmc) if has_rmc else ("VTG", _parse_vtg)
     row, broken, (time_ns, speed, course, status) = _read(sentences, kind, parse, 4)
@@ -101,7 +101,7 @@ def _split_fields(body: str, checksum: str | None) -> list[str]:
 
 
 def _to_integers(values: Floats) -> Ints:
-    """Return values as integers, -1 where there is none."""
+    """Return values as integers, -1 for missing ones."""
     return np.where(np.isfinite(values), values, -1).astype(np.int64)
 
 

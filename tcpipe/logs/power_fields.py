@@ -35,7 +35,7 @@ _PHASE = re.compile(r"phase|motors?|q|d|rms")
 
 @dataclass(frozen=True, slots=True)
 class PowerFields:
-    """What is read together: each rail's fields by quantity, with the factor that the unit in its name states, and what is unclear."""
+    """Fields read together: those of each rail by quantity, with the factor that the unit in its name states, and what is unclear."""
 
     rails: tuple[Mapping[str, str], ...]
     scales: Mapping[str, float]
@@ -163,7 +163,7 @@ def _rank(group: Sequence[_Named]) -> tuple[bool, bool, bool]:
 
 
 def _take_first_element(name: str) -> str:
-    """Return the first element of a list: the sum of voltages is none."""
+    """Return the first element of a list: voltages are not summed."""
     return name.replace("[]", "[0]")
 
 

@@ -1,6 +1,6 @@
-"""What a message definition says of the bytes: scalars, texts, arrays and records, as one small tree; and the text of a definition.
+"""Layout of messages by their definition: scalars, texts, arrays and records as one small tree, and parsing of the text of a definition.
 
-Both ROS 1 serialisation and CDR lay these types out field after field; how is `tcpipe.logs.wire_types`'s knowledge.
+Both ROS 1 serialisation and CDR write these types field after field.
 
 A .msg definition (http://wiki.ros.org/msg, and ROS 2's bounds and defaults) in a log holds the message first, then every message it is
 made of, each below a line of ``=`` and ``MSG: package/Name``. Constants, defaults and comments do not matter for reading.
@@ -244,7 +244,7 @@ ROS1 = Dialect("<", 0, 1, 0, 0, 0)
 
 
 def find_dialect(payload: bytes, encoding: str) -> Dialect:
-    """Return the dialect of a message, in CDR by its first bytes; `LayoutError` where these are none of CDR's plain ones."""
+    """Return the dialect of a message, in CDR by its first bytes; `LayoutError` for any but CDR's plain ones."""
     if encoding == "ros1":
         return ROS1
     if len(payload) < _CDR_HEADER or payload[0] != 0 or payload[1] not in _CDR_BYTE_ORDER:
@@ -319,7 +319,7 @@ Values = Scalars | Runs | Fields | Lists
 
 @dataclass(frozen=True, slots=True)
 class WalkResult:
-    """What a walk found; ``fits`` (N,) says which messages fit their definition: the values are those of these only."""
+    """Values of the messages that fit their definition; ``fits``, (N,), marks these messages."""
 
     root: Fields | None
     fits: NDArray[np.bool_]

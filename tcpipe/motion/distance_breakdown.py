@@ -1,8 +1,8 @@
-"""Where every metre of a track went: the stretches that are kept, and the reason of each interval that is not.
+"""Distance breakdown of a track: the spans that are kept, and the reason of each interval that is masked.
 
-The odometer is the horizontal length of the estimated track: Hermite arcs inside its pieces, straight lines across its holes. Where an
-estimate jumps to another place nobody drove: such a step counts as long as its speed makes it. Each interval between two rows belongs to
-one entry, so their sum is the odometer (docs/explanation/rulings.md, Marked, not deleted).
+The odometer is the horizontal length of the estimated track: Hermite arcs inside its sections, straight lines across its gaps. A jump of
+the estimate is no driving: such a step counts by its speed. Each interval between two rows belongs to one entry, so their sum is the
+odometer (docs/explanation/rulings.md, Marked, not deleted).
 
 The catalogue of findings says how to avoid each large loss (``lost-...``).
 """
@@ -114,7 +114,7 @@ class StoreLoss:
     reason: str
     metres: float
     share: float
-    """Of all metres driven [1]."""
+    """Fraction of all metres driven [1]."""
     runs: int
     """Runs that lost metres so."""
 

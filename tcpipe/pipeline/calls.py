@@ -47,7 +47,7 @@ def is_alive(process: Process) -> bool | None:
 
 
 def _read_start_time(pid: int) -> str:
-    """Return when a living process began, in ticks since the start of the machine (proc(5): stat); "" where there is none."""
+    """Return when a living process began, in ticks since the start of the machine (proc(5): stat); "" without such a process."""
     state, *more = _read_text(f"/proc/{pid}/stat").rpartition(")")[2].split() or [""]
     return "" if state in ("", "Z", "X", "x") else more[18]
 
@@ -218,7 +218,7 @@ def _is_done_by(call: Call, other: Call) -> bool:
 
 
 def is_below(entry: str, folders: Sequence[str]) -> bool:
-    """Return whether a path or URL is one of those given, or lies below one."""
+    """Return whether a path or URL is one of those given, or is in one of them."""
     return any(entry == folder or entry.startswith(f"{folder.rstrip('/')}/") for folder in folders)
 
 
@@ -232,7 +232,7 @@ INGEST, BUILD, ADD_MAP, PRUNE, ACKNOWLEDGE = "ingest", "build-dataset", "add-map
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """What work takes: CPU seconds and bytes written, for a byte of log or for a sample; and CPU seconds of a call, whatever it does."""
+    """Cost of work: CPU seconds and bytes written per byte of log or per sample, and CPU seconds per call."""
 
     cpu_s: float
     written_bytes: float
@@ -245,7 +245,7 @@ MEASURED = {INGEST: Rates(0.2e-6, 1.1, 0.7), BUILD: Rates(180e-6, 4_300.0, 1.5)}
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What is to be expected: work, time and room."""
+    """Expected work, time and bytes."""
 
     of: str
     amount: int
@@ -253,7 +253,7 @@ class Estimate:
     wall_s: float
     written_bytes: int
     source: str
-    """What it was taken from."""
+    """Source of the figures."""
 
     def __str__(self) -> str:
         """Return it as one line."""
@@ -262,9 +262,9 @@ class Estimate:
 
 
 def estimate(calls: Sequence[Call], command: str, amount: int, *, jobs: int) -> Estimate:
-    """Return what work will take: by the calls that did the like, or by what was measured elsewhere.
+    """Return the estimate for some work, from earlier calls of the same command and from default figures.
 
-    What was measured counts as one more call, of as much work as takes as long as a call alone: few samples tell little of a million.
+    The default figures count as one more call, with as much work as takes the time of an empty call: few samples do not predict a million.
     """
     like = [call for call in calls if call.command == command and _parse_amount(call)]
     unit = "logs" if command == INGEST else "samples"

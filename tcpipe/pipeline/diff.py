@@ -1,4 +1,4 @@
-"""What changed between two datasets, and by which cause: code, recipe keys, logs, maps, region; with the shift of the labels."""
+"""Changes between two datasets and their causes: code, recipe keys, logs, maps, region; with the shift of the labels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import clean_lines
-from tcpipe.formats.dataset_card import Change, DatasetCard, MapSource, compare_records, format_value
+from tcpipe.formats.dataset_card import DatasetCard, MapSource, RecordChange, compare_records, format_value
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches, read_card, read_samples, sample_columns
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.published_outputs import fetch_directory
@@ -26,7 +26,7 @@ _STDS = ("power_std_watt", "velocity_std_mps", "duration_std_s", "energy_std_jou
 _LABELLED = (*_LABELS, "fused_velocity_mps", *_STDS)
 _DRAWN = ("split", "fold")
 _SHARED = 0.9
-"""So much of their time samples share that are compared."""
+"""Smallest shared fraction of the time of two samples that are compared."""
 
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -39,7 +39,7 @@ class Difference:
     a: str
     b: str
     causes: tuple[str, ...]
-    """What the two are made from differently."""
+    """Differences of the inputs of both."""
     samples: Mapping[str, int]
     """Samples only in one, in both, and how many of these have other labels, columns beside them, patches, folds."""
     moved: Mapping[str, int]
@@ -66,7 +66,7 @@ _CHANGES = ("only in a", "only in b", "other labels", "other columns", "other pa
 
 
 def diff(a: str | Path, b: str | Path) -> Difference:
-    """Compare two datasets; `DatasetError` if either is none."""
+    """Compare two datasets; `DatasetError` if either is no dataset."""
     first, second = fetch_directory(a), fetch_directory(b)
     cards = read_card(first), read_card(second)
     there = [sample_columns(directory) for directory in (first, second)]
@@ -227,7 +227,7 @@ _WORDS = {
     "versions": "version", "runs": "run", "tags": "chosen tags", "maps": "map", "map_names": "order of maps", "exclusions": "exclusion",
     "file_format": "format",
 }  # fmt: skip
-"""What a field of `DatasetInputs` is called; others by their name."""
+"""Names of fields of `DatasetInputs` in messages; other fields keep their name."""
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -240,7 +240,7 @@ def list_causes(a: DatasetCard, b: DatasetCard) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _describe_change(change: Change, a: DatasetCard, b: DatasetCard) -> str:
+def _describe_change(change: RecordChange, a: DatasetCard, b: DatasetCard) -> str:
     """Return what differs in an entry, by its value or, of content, that it is another."""
     field = change.path[0]
     head, name = _WORDS.get(field, field.replace("_", " ")), f" {change.name}" if change.name else ""

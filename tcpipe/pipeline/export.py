@@ -27,18 +27,18 @@ from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import add_metadata, read_metadata
 
 INDEX = "export.json"
-"""What a directory of exported topics holds, and of which log: a second call finds it done."""
+"""File that lists the exported topics and their log, so that a second call has nothing to do."""
 _LONGEST_STEM = 200
 
 
 @dataclass(frozen=True, slots=True)
 class ExportOrigin:
-    """What an export depends on."""
+    """Inputs of an export."""
 
     log: str
     """Its path or URL."""
     size_and_time: tuple[tuple[int, int], ...]
-    """Of each file of it [byte, ns]."""
+    """Size and modification time of each of its files [byte, ns]."""
     message_definitions: str
     tcpipe_version: str
 
@@ -96,12 +96,12 @@ def export(
 ) -> Exported:
     """Write each topic to ``out/<topic>.parquet``: one row a message, columns by dotted field name, the definition in the metadata.
 
-    The log, or that at a URL, is read once and written piece by piece: memory does not grow with it. What ``out`` holds already of the
-    same log is left alone. Without ``topics`` all are written; one text may name several, divided by commas. ``message_definitions`` is a
-    directory of .msg or .idl files for types that the log does not define.
+    The log, or that at a URL, is read once and written piece by piece: memory does not grow with it. Topics of the same log that ``out``
+    has are not written again. Without ``topics`` all are written; one text may name several, divided by commas. ``message_definitions``
+    is a directory of .msg or .idl files for types that the log does not define.
 
     `LogError`: the log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another
-    log or is none of an export, or ``out`` is a dataset, run, map, model, cost map or store.
+    log or to no export, or ``out`` is a dataset, run, map, model, cost map or store.
     """
     _refuse_what_is_ours(out)
     clear(out)
@@ -175,7 +175,7 @@ def _refuse_what_is_ours(out: Path) -> None:
 
 
 def _refuse_others_files(index: ExportIndex | None, made_from: ExportOrigin, paths: Mapping[str, Path]) -> None:
-    """Refuse to write into the export of another log, or over a file that is none of an export."""
+    """Reject the export of another log, and files that are not of an export."""
     known = set[str | None]()
     if index is not None:
         known = {entry.file for entry in index.topics.values()}

@@ -19,7 +19,7 @@ from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_presigned, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
-from tcpipe.formats.runs import Failure, find_lineage, find_problems, make_failure
+from tcpipe.formats.runs import LogFailure, find_lineage, find_problems, make_failure
 from tcpipe.pipeline.calls import INGEST, RunningCall, count_bytes, estimate, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.log_sources import (
@@ -31,7 +31,7 @@ from tcpipe.pipeline.log_sources import (
     select_shard,
 )
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result, plan
+from tcpipe.pipeline.plan import IngestResult, IngestTask, PlannedLog, check_age, make_died_result, make_result, plan
 from tcpipe.pipeline.problems import is_acknowledged
 from tcpipe.recipe import Recipe, TimeWindow
 from tcpipe.store import is_store, open_store
@@ -56,7 +56,7 @@ def make_tasks(
 Item: TypeAlias = tuple[int, IngestTask]
 
 
-def iterate_rounds(steps: Sequence[Step]) -> list[list[Item]]:
+def iterate_rounds(steps: Sequence[PlannedLog]) -> list[list[Item]]:
     """Return logs to ingest side by side, then those with the size of one of them: the first of equal logs names their run."""
     sizes, rounds = set[int](), [list[Item](), list[Item]()]
     for index, step in enumerate(steps):
@@ -109,7 +109,7 @@ class SummaryLine:
 
 @dataclass(frozen=True, slots=True)
 class CallOptions:
-    """Options of a call of ingest: by them `tcpipe status` asks again what it would find, and other work is told from the same."""
+    """Options of a call of ingest: `tcpipe status` repeats the call with them, and they identify its work."""
 
     robot: str | None = None
     as_one: bool = False
@@ -184,7 +184,7 @@ def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path, *, is_
     return summary
 
 
-def _announce_new_results(steps: Sequence[Step], state: State) -> None:
+def _announce_new_results(steps: Sequence[PlannedLog], state: State) -> None:
     """Say how many runs are made again because this version of tcpipe gives other results, and what that takes."""
     contents = {row.log.sha256 for row in state.runs.values() if row.results_version != RESULTS_VERSION}
     again = [step for step in steps if step.state == "outdated" and step.task.source.sha256 in contents]
@@ -236,7 +236,7 @@ def _iterate_missing(found: FoundLogs) -> Iterator[tuple[int, IngestResult]]:
         yield index, IngestResult(name, "failed", causes=findings, problems=lines, transient=True)
 
 
-def _iterate_finished(state: State, steps: Sequence[Step]) -> Iterator[tuple[int, IngestResult]]:
+def _iterate_finished(state: State, steps: Sequence[PlannedLog]) -> Iterator[tuple[int, IngestResult]]:
     """Yield the result of each log that is in the store, is known to fail, or has to wait."""
     for index, step in enumerate(steps):
         source, made = step.task.source, step.made
@@ -256,7 +256,7 @@ def _iterate_finished(state: State, steps: Sequence[Step]) -> Iterator[tuple[int
 
 
 def _iterate_results(
-    call: RunningCall, steps: Sequence[Step], *, jobs: int, cluster: str | None
+    call: RunningCall, steps: Sequence[PlannedLog], *, jobs: int, cluster: str | None
 ) -> Iterator[tuple[int, IngestResult]]:
     """Yield what became of each log by its index, as it ends."""
     known = {problem.key for row in call.state.runs.values() for problem in find_problems(row)}
@@ -277,7 +277,7 @@ def _record_result(call: RunningCall, task: IngestTask, ended: Ingested, known: 
                 replace(task, source=replace(source, sha256=result.sha256)),
                 result.sha256 or source.files_digest,
             )
-            failure = Failure(content, source.origins, result.problems, __version__, result.findings)
+            failure = LogFailure(content, source.origins, result.problems, __version__, result.findings)
             call.store.put(state, "failed", task.failure_key, failure)
         if result.sha256 and source.files and result.status != "waiting":
             seen = source.sighting(result.sha256)

@@ -159,7 +159,7 @@ def find_twin(known: RunFacts, source: LogSource) -> str | None:
 def _find_stored_streams(
     store: Store, state: State, known: Iterable[RunFacts], task: IngestTask, key: str
 ) -> _Read | None:
-    """Return the streams of a run of the same log that were made with the same settings; None where there are none."""
+    """Return the streams of a run of the same log that were made with the same settings; None without any."""
     for row in known:
         if not task.force and row.read_key == key and row.streams_blob in state.blobs:
             streams = read_streams(store.place, row)

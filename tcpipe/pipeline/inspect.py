@@ -1,4 +1,4 @@
-"""What a path holds: a log, a map, a dataset, a run or a store, told without changing anything."""
+"""Inspection of a log, a map, a dataset, a run or a store, which changes nothing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedLogs:
-    """What every log of a folder holds."""
+    """Inspection of every log of a folder."""
 
     kind: Literal["logs"] = "logs"
     path: str
@@ -80,7 +80,7 @@ class GradedRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedStore:
-    """What a store holds."""
+    """Inspection of a store."""
 
     kind: Literal["store"] = "store"
     path: str
@@ -110,10 +110,10 @@ def inspect(
     message_definitions: Path | None = None,
     store: Path | str = "tcpipe-store",
 ) -> Inspected:
-    """Return what the path, or the run of a store, holds; with ``full`` from every message of a log, for damage, gaps, stamps and clocks.
+    """Return the content of a path or a run of the store; with ``full`` read every message of a log, for damage, gaps and clocks.
 
     ``message_definitions`` is a directory of .msg or .idl files for types that a log does not define. `UsageError`, `LogError`,
-    `MapError`, `DatasetError`, `StoreError`: it is none of these, or cannot be read.
+    `MapError`, `DatasetError`, `StoreError`: the path is something else, or cannot be read.
     """
     ask = partial(
         _inspect_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions
@@ -236,4 +236,4 @@ class InspectedTables:
     kind: Literal["tables"] = "tables"
     path: str
     recipe: str
-    """What ``tcpipe init --from`` would write [TOML]."""
+    """Recipe of ``tcpipe init --from`` [TOML]."""

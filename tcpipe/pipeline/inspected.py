@@ -1,4 +1,4 @@
-"""What `tcpipe inspect` says of a map and of a dataset: all that they say of themselves. It takes longer to load than a log to inspect."""
+"""Results of `tcpipe inspect` for maps and datasets; apart from those for logs, because these imports take long."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tcpipe.formats.maps.map_facts import MapSummary
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedMap(MapSummary):
-    """What a map is."""
+    """Summary of a map."""
 
     kind: Literal["map"] = "map"
     path: str
@@ -19,7 +19,7 @@ class InspectedMap(MapSummary):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedDataset(DatasetCard):
-    """What a dataset is: its card."""
+    """Card of a dataset."""
 
     kind: Literal["dataset"] = "dataset"
     path: str

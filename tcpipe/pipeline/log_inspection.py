@@ -1,4 +1,4 @@
-"""What a log holds: topics and roles from its index; with everything read, also gaps, clocks and damage."""
+"""Inspection of a log: topics and roles from its index; with everything read, also gaps, clocks and damage."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tcpipe.cost.labels import find_wanted_rate, is_too_slow
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, SECOND_NS, SIMULATED_NS, Timeline, TopicTimes, settle_clocks
+from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, SECOND_NS, SIMULATED_NS, TopicTimeline, TopicTimes, settle_clocks
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic, split_notes
 from tcpipe.pipeline.log_sources import find_damaged_log, find_total_loss
@@ -55,9 +55,9 @@ class StampCounts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedTopic:
-    """What the index tells of a topic, and with everything read what its messages do.
+    """Facts of a topic from the index, and, if all messages are read, from these.
 
-    What only reading everything tells is None without.
+    Facts that need all messages are None without.
     """
 
     name: str
@@ -75,13 +75,13 @@ class InspectedTopic:
     time_why: str | None = field(default=None, metadata=ABSENT)
     header_minus_log_s: float | None = None
     moved_s: tuple[float, ...] | None = field(default=None, metadata=ABSENT)
-    """What was added to its stamps to bring them to most topics' clock, by epoch [s]."""
+    """Offsets added to its stamps to bring them to the clock of most topics, by clock epoch [s]."""
     simulated_time: bool | None = field(default=None, metadata=ABSENT)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedLog:
-    """What a log holds; of one that cannot be read only its path and the problems are known."""
+    """Content of a log; of one that cannot be read only its path and the problems."""
 
     kind: Literal["log"] = "log"
     path: str
@@ -94,12 +94,12 @@ class InspectedLog:
     topics: tuple[InspectedTopic, ...] | None = field(default=None, metadata=ABSENT)
     clock_steps: tuple[ClockStep, ...] | None = field(default=None, metadata=ABSENT)
     problems: tuple[str, ...] = ()
-    """What is to be decided before it can be ingested, or why it cannot be read."""
+    """Decisions that ingest needs, or why the log cannot be read."""
     findings: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
     damage: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
     notes: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
     recipe: str | None = field(default=None, metadata=ABSENT)
-    """What ``tcpipe init --from`` would write, less what the recipe settles [TOML]."""
+    """Recipe of ``tcpipe init --from`` without the keys that the recipe has [TOML]."""
 
 
 def inspect_log(
@@ -151,7 +151,7 @@ def inspect_log(
 
 
 def _inspect_index(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
-    """Return what the index tells of a topic."""
+    """Return the facts of a topic in the index."""
     mine = {name: role.why for name, role in cast.roles.items() if topic.name in role.topics}
     played = (", ".join(mine), "; ".join(mine.values())) if mine else None
     if topic.name in cast.transforms:
@@ -170,7 +170,7 @@ def _inspect_index(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
 def _read(
     log: Log | TableLog, topics: tuple[InspectedTopic, ...]
 ) -> tuple[tuple[InspectedTopic, ...], tuple[ClockStep, ...]]:
-    """Read every message; return the topics with what that tells of them, and what the clocks did."""
+    """Read every message; return the topics with the facts of their messages, and the clock epochs."""
     found: dict[str, TopicStamps] = {}
     for tables in log.batches(sorted(log.topics)):
         for name, table in tables.items():
@@ -193,7 +193,7 @@ def _read(
 
 
 def _add_stamps(
-    topic: InspectedTopic, stamps: TopicStamps, timeline: Timeline | None, *, simulated: bool
+    topic: InspectedTopic, stamps: TopicStamps, timeline: TopicTimeline | None, *, simulated: bool
 ) -> InspectedTopic:
     """Return a topic with what its messages do; without a timeline they have no header."""
     counts = stamps.counts()

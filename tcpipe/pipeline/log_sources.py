@@ -44,15 +44,15 @@ class LogSource:
     sha256: str | None = None
     """None where it has yet to be computed."""
     urls: tuple[str, ...] = ()
-    """Where the files lie, if one lies in object storage; ``paths`` then are stand-ins of the right names and sizes."""
+    """Locations of the files, if one is in object storage; ``paths`` then are stand-ins of the same names and sizes."""
     queries: tuple[str, ...] = field(default=(), repr=False)
-    """Of presigned URLs, in the order of ``urls``: never shown, never stored."""
+    """Queries of presigned URLs, in the order of ``urls``; they are not printed or stored."""
     place: str = ""
-    """Where the log lies in the folder that was given: the same wherever that is mounted."""
+    """Path of the log in the folder that was given, which does not depend on where that is mounted."""
 
     @property
     def name(self) -> str:
-        """What the log is called in messages."""
+        """Name of the log in messages."""
         return clean_line(" + ".join(self.origins))
 
     @property
@@ -68,7 +68,7 @@ class LogSource:
 
     @property
     def stem(self) -> str:
-        """What the run is called after: the first name without its suffix, as text that can be printed and be a file name."""
+        """First part of the run's id: the first name without its suffix, as printable text that can be a file name."""
         path = self.paths[0]
         if path.is_dir():
             stem = path.name
@@ -80,7 +80,7 @@ class LogSource:
 
     @property
     def files_digest(self) -> str:
-        """What stands for the log's content where that cannot be had: a hash (hex) over names, sizes and times."""
+        """Substitute for the log's hash if the log cannot be read: a hash (hex) over names, sizes and times."""
         return digest({"log": self.origins, "files": self.files})
 
     def sighting(self, sha256: str) -> LogSnapshot:
@@ -104,7 +104,7 @@ class LogSource:
         return self.youngest_ns if self.urls else max(times, default=0)
 
     def now(self) -> LogSource:
-        """Return the log as it is now: what was written since is another content; in object storage nobody looks again."""
+        """Return the log as it is now: a file that was written since has another content; object storage is not listed again."""
         if self.urls:
             return self
         files = _list_file_states(self.paths)
@@ -131,8 +131,8 @@ def find_sources(
 ) -> FoundLogs:
     """Return the logs at or below the given paths.
 
-    With ``as_one`` they are all parts of one. For what lies in object storage there are stand-ins in ``staging``. A folder that holds one
-    of the files of ``tables`` is a log; where their names have a ``*``, the files of each run are one.
+    With ``as_one`` they are all parts of one. Logs in object storage get stand-ins in ``staging``. A folder with one of the files
+    of ``tables`` is a log; if their names have a ``*``, the files of each run are one log.
     """
     paths: dict[str, list[tuple[Path, str]]] = {}
     urls: dict[Path, str] = {}
@@ -175,7 +175,7 @@ def find_sources(
 
 
 def find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
-    """Return the files of each log at or below a path, mapped tables among them; `LogError` where there is none."""
+    """Return the files of each log at or below a path, mapped tables among them; `LogError` without any."""
     if of_tables := find_table_logs(path, tables) if tables else []:
         return [*((log,) for log in (list_logs_below(path) if path.is_dir() else ())), *of_tables]
     try:
@@ -194,7 +194,7 @@ def find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
 
 
 def _find_lone_parts(paths: Iterable[Path], *, together: bool) -> Iterator[tuple[Path, str]]:
-    """Yield the files that are parts of a ROS 2 bag, given without the others: what does not change stands in the first part only."""
+    """Yield the files that are parts of a ROS 2 bag, given without the others: only the first part has static transforms."""
     folders: dict[str, list[Path]] = {}
     for path in paths:
         if str(path).endswith(STORAGE_SUFFIXES):
@@ -234,14 +234,14 @@ def find_remote_logs(url: str, directory: Path) -> dict[Path, str]:
 
 
 def _as_named(path: Path) -> Path:
-    """Return a log's path in full, as the user names it; what lies above a ``..`` may be a link, and is followed."""
+    """Return a log's path in full, as the user names it; links above a ``..`` are followed."""
     if ".." not in path.parts:
         return path.absolute()
     return path.resolve() if path.name == ".." else path.parent.resolve() / path.name
 
 
 def _place_in(path: Path, entry: Path) -> str:
-    """Return where a log lies in what the user gave; tables of a run may lie beside its first one."""
+    """Return the path of a log in the folder that the user gave; tables of a run may be next to its first one."""
     if path == entry:
         return path.name or path.resolve().name
     return str(path).removeprefix(f"{entry}/").lstrip("/")

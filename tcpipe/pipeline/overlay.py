@@ -1,4 +1,4 @@
-"""A run as a log of its own, to lie beside the recording in a viewer: track, segments, masked rows and rejections on the recorder's clock.
+"""A run as a log for a viewer that also shows the recorded log: track, segments, masked rows and rejections on the recorder's clock.
 
 ROS 2 messages in MCAP: Foxglove, Rerun and PlotJuggler all read them (docs/how-to/viewers.md). Their fields are the tables' columns.
 """

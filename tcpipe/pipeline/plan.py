@@ -16,7 +16,7 @@ from tcpipe.errors import TcpipeError, clean_line, hide_secrets
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.runs import Call, Failure, RunFacts, find_problems, make_failure
+from tcpipe.formats.runs import Call, LogFailure, RunFacts, find_problems, make_failure
 from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient, recall_hash
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import Finding, Verdict, select_problems
@@ -63,16 +63,16 @@ class IngestTask:
 
 @dataclass(frozen=True, slots=True)
 class IngestResult:
-    """What became of one log."""
+    """Result of one log."""
 
     log: str
     status: Status
     run: RunFacts | None = None
-    """What the store has of its run; None of a log that waits, or failed."""
+    """Run in the store; None if the log waits or failed."""
     verdict: Verdict | None = None
-    """Of the run."""
+    """Findings of the run."""
     causes: tuple[Finding, ...] = ()
-    """Of a log that failed: what went wrong."""
+    """Findings on why the log failed."""
     problems: tuple[str, ...] = ()
     """Why it failed, as lines."""
     same_as: str | None = None
@@ -96,14 +96,14 @@ class IngestResult:
 
     @property
     def is_new_problem(self) -> bool:
-        """Whether something is wrong that nobody was told before, or acknowledged."""
+        """Whether it has a problem that is neither reported before nor acknowledged."""
         is_wrong = self.status == "failed" or bool(select_problems(self.findings))
         return is_wrong and not self.known and not self.acknowledged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogLine(IngestResult):
-    """What became of one log, as ``ingest --json`` says it when the log ends."""
+    """Result of one log, as ``ingest --json`` prints it when the log ends."""
 
     kind: Literal["log"] = "log"
     is_new_problem: bool = False
@@ -177,24 +177,24 @@ LogState: TypeAlias = Literal[
 
 LOG_STATES: tuple[LogState, ...] = get_args(LogState)
 TO_DO: tuple[LogState, ...] = ("pending", "outdated", "failed_transient")
-"""What the next ingest works on."""
+"""States of logs that the next ingest reads."""
 TROUBLE: tuple[LogState, ...] = ("failed_permanent", "failed_transient", "partial", "empty")
-"""What somebody should look at."""
+"""States of logs that need attention."""
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """What a log needs."""
+class PlannedLog:
+    """State of a log, and its next step."""
 
     task: IngestTask
     state: LogState
     cause: str = ""
     made: RunFacts | None = None
     """The ingestion of the log as it would be made now, where there is one."""
-    failure: Failure | None = None
+    failure: LogFailure | None = None
     """Why the log is not tried again."""
     findings: tuple[Finding, ...] = ()
-    """What is wrong with it, where that is known as data."""
+    """Findings on its problems."""
     has_failed: bool = False
     """Whether it failed before, under whatever conditions."""
 
@@ -211,13 +211,13 @@ class _Known:
     state: State
     acknowledged: Collection[str]
     made: Mapping[str, list[RunFacts]]
-    failures: Mapping[str, list[Failure]]
+    failures: Mapping[str, list[LogFailure]]
     passing: Mapping[str, str]
 
 
-def make_planner(state: State) -> Callable[[IngestTask], Step]:
+def make_planner(state: State) -> Callable[[IngestTask], PlannedLog]:
     """Return a function that finds what a log needs, if it is to be ingested now."""
-    made, failures = dict[str, list[RunFacts]](), dict[str, list[Failure]]()
+    made, failures = dict[str, list[RunFacts]](), dict[str, list[LogFailure]]()
     for row in state.runs.values():
         made.setdefault(row.log.sha256, []).append(row)
     for failure in state.failed.values():
@@ -227,12 +227,12 @@ def make_planner(state: State) -> Callable[[IngestTask], Step]:
     return partial(_decide, known=known, now_ns=time.time_ns())
 
 
-def plan(tasks: Iterable[IngestTask], state: State) -> tuple[Step, ...]:
+def plan(tasks: Iterable[IngestTask], state: State) -> tuple[PlannedLog, ...]:
     """Return what each log needs."""
     return tuple(map(make_planner(state), tasks))
 
 
-def _decide(task: IngestTask, known: _Known, now_ns: int) -> Step:  # noqa: PLR0911  one for each state
+def _decide(task: IngestTask, known: _Known, now_ns: int) -> PlannedLog:  # noqa: PLR0911  one for each state
     if not task.force:
         task = replace(task, source=recall_hash(task.source, known.state.find_seen(task.source.origins)))
     source, sha256 = task.source, None if task.force else task.source.sha256
@@ -246,38 +246,40 @@ def _decide(task: IngestTask, known: _Known, now_ns: int) -> Step:  # noqa: PLR0
         is_acknowledged = make_failure(failed.content, failed.log).key in known.acknowledged
         cause = _remove_name("".join(failed.problems[:1]), task)
         state: LogState = "quarantined" if is_acknowledged else "failed_permanent"
-        return Step(task, state, cause, failure=failed, findings=failed.findings)
+        return PlannedLog(task, state, cause, failure=failed, findings=failed.findings)
     if source.name in known.passing:  # it was old enough then
-        return Step(task, "failed_transient", _remove_name(known.passing[source.name], task))
+        return PlannedLog(task, "failed_transient", _remove_name(known.passing[source.name], task))
     if check_age(task, now_ns):
-        return Step(task, "growing", has_failed=_describe_content(task) in known.failures)
+        return PlannedLog(task, "growing", has_failed=_describe_content(task) in known.failures)
     if current is not None:
-        return Step(
+        return PlannedLog(
             task, *(("outdated", "its tags change") if is_there else ("pending", "the files of its run are missing"))
         )
     if made:
-        return Step(task, "outdated", _describe_outdated(made[-1], task))
-    return Step(task, "pending", _describe_pending(task, known), has_failed=_describe_content(task) in known.failures)
+        return PlannedLog(task, "outdated", _describe_outdated(made[-1], task))
+    return PlannedLog(
+        task, "pending", _describe_pending(task, known), has_failed=_describe_content(task) in known.failures
+    )
 
 
 def _describe_content(task: IngestTask) -> str:
     return task.source.sha256 or task.source.files_digest
 
 
-def _stand(task: IngestTask, made: RunFacts, known: _Known) -> Step:
+def _stand(task: IngestTask, made: RunFacts, known: _Known) -> PlannedLog:
     """Return the step of a log that is in the store as it would be made now."""
     if not made.blob:
-        return Step(task, "superseded", "its run was pruned; --force ingests it again", made)
+        return PlannedLog(task, "superseded", "its run was pruned; --force ingests it again", made)
     if made.superseded_by:
-        return Step(task, "superseded", "superseded by a longer log", made)
+        return PlannedLog(task, "superseded", "superseded by a longer log", made)
     problems = find_problems(made)
     if not problems:
-        return Step(task, "done", made=made)
+        return PlannedLog(task, "done", made=made)
     if all(problem.key in known.acknowledged for problem in problems):
-        return Step(task, "done", f"{made.defect}, acknowledged", made)
+        return PlannedLog(task, "done", f"{made.defect}, acknowledged", made)
     findings = tuple(problem.finding for problem in problems)
     cause = describe_finding((*made.damage, *findings)[0])
-    return Step(task, "empty" if made.is_empty else "partial", cause, made, findings=findings)
+    return PlannedLog(task, "empty" if made.is_empty else "partial", cause, made, findings=findings)
 
 
 def _describe_pending(task: IngestTask, known: _Known) -> str:
@@ -290,7 +292,7 @@ def _describe_pending(task: IngestTask, known: _Known) -> str:
     return "its content has changed" if known.state.find_seen(task.source.origins) and not task.source.sha256 else ""
 
 
-def _describe_failure(before: Sequence[Failure], task: IngestTask) -> str:
+def _describe_failure(before: Sequence[LogFailure], task: IngestTask) -> str:
     if task.force or task.retry_failed:
         return "failed before"
     latest = max(failure.version for failure in before)

@@ -46,7 +46,7 @@ def find_incomplete_maps(state: State, name: str | None = None) -> Iterator[Prob
 
 
 def make_waiting(source: LogSource, state: str) -> Problem:
-    """Return the problem that a log lies there and no call takes it in; that of other content, written since, is another."""
+    """Return the problem that no call ingests a log; if the log is written again, it is another problem."""
     finding = make_finding("log-waiting", Subject("log", source.name), names={"state": state})
     return Problem(finding, source.files_digest, source.origins)
 
@@ -101,8 +101,8 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
 
     A run whose tables are missing is given up: it is not expected any more. A killed call counts as ended.
 
-    Raises `StoreError`: there is no store, or it cannot be written; `UsageError`: a name is none of a run, log or dataset with a
-    problem, or of several logs; nothing was acknowledged then.
+    Raises `StoreError`: there is no store, or it cannot be written; `UsageError`: a name is not that of one run, log or dataset
+    with a problem; nothing is acknowledged then.
     """
     opened = open_store(store)
     with record_call(opened, ACKNOWLEDGE, names) as call:
@@ -173,7 +173,7 @@ def _make_missing_problem(name: str, state: State) -> list[Problem]:
 
 
 def _make_waiting_problem(name: str, state: State) -> list[Problem]:
-    """Return the problem of a log by its path or URL that the store does not hold: nobody wants to be told that it waits."""
+    """Return the problem that a log is not in the store, by its path or URL: the user wants no report that it waits."""
     with make_scratch_directory() as staging:
         sources = find_sources([name], as_one=False, staging=staging).sources
     return [make_waiting(source, "pending") for source in sources if state.find_seen(source.origins) is None]

@@ -161,8 +161,8 @@ def propose_for_log(
 ) -> ProposedRecipe:
     """Return the recipe for a log as ``init --from`` writes it: what a recipe does not settle yet.
 
-    ``proposals`` are what `find_proposals` finds in it. Unless it ``is_complete``, values are those of the first messages, and what only
-    moving transforms could tell of a sensor's place is left out.
+    ``proposals`` are what `find_proposals` finds in it. Unless it ``is_complete``, values are those of the first messages, and extrinsics
+    from moving transforms are left out.
     """
     config = find_read_config(recipe, log.topics)
     used = {name: role for role, names in assigned.choices.items() for name in names}
@@ -339,8 +339,8 @@ def propose_tables(path: Path) -> ProposedRecipe:
 def _group_files(folder: Path, columns: Mapping[Path, Sequence[str]]) -> dict[str, Path]:
     """Return the files of the largest run by their names in the recipe, in which a * replaces the part that differs between runs.
 
-    A part of a name tells runs apart if every table has several such files, with the same columns. Of one kind of table these are logs of
-    all sensors; else the numbers may be those of motors.
+    A part of a name differs between runs if every table has several such files with the same columns. Files of one kind of table are logs
+    of all sensors; else the numbers may be those of motors.
     """
     names = {file: file.relative_to(folder).as_posix() for file in columns}
     if len(names) == 1:  # the next log of this recorder has another number

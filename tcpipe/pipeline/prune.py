@@ -17,7 +17,7 @@ from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
 from tcpipe.formats.dataset_files import CARD, parse_card
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.object_storage import make_absolute
-from tcpipe.formats.place import Entry
+from tcpipe.formats.place import FileEntry
 from tcpipe.formats.published_outputs import find_newest
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Run, RunFacts
@@ -48,7 +48,7 @@ class Leftover:
 
 @dataclass(frozen=True, slots=True)
 class Pruned:
-    """What went, or would go, and what stays."""
+    """Removed and kept items of a call, or of its dry run."""
 
     store: str
     dry_run: bool
@@ -57,7 +57,7 @@ class Pruned:
     documents: int
     """Documents that went: replaced ones, and calls before the latest."""
     size_bytes: int
-    """Of the payload that went."""
+    """Size of the removed payload [byte]."""
     waits_for: str | None = None
     """A call that may still run: nothing went."""
 
@@ -176,7 +176,7 @@ def _find_references(state: State, forgotten: Collection[str]) -> dict[tuple[str
 
 
 def _read_inputs(where: str) -> str | None:
-    """Return the digest of what the dataset at a path or URL is made of; None if there is none that can be read."""
+    """Return the digest of what the dataset at a path or URL is made of; None without a readable one."""
     try:
         found = find_newest(where, [CARD])
         return None if found is None else parse_card(found.data, found.place.where(CARD), proved=False).inputs
@@ -186,7 +186,7 @@ def _read_inputs(where: str) -> str | None:
 
 @dataclass(slots=True)
 class _Removal:
-    """What one call removes, decided step by step, then executed."""
+    """Items that one call removes, decided step by step, then removed."""
 
     store: Store
     first: State
@@ -220,7 +220,7 @@ class _Removal:
             self.chosen[key], self.earlier[key] = (row, what), document
 
     def take_back(self, second: State, *, is_all: bool) -> None:
-        """Let runs count again if an output refers to them that was written meanwhile, or if nothing can be removed now."""
+        """Restore runs if a new output refers to them, or if nothing can be removed now."""
         self.forgotten = [name for name in self.forgotten if self.first.outputs[name] == second.outputs.get(name)]
         held = _find_references(second, self.forgotten) if self.chosen else {}
         for key, (row, what) in [*self.chosen.items()]:
@@ -241,7 +241,7 @@ class _Removal:
         last += [self.first.names["outputs", make_key(where)] for where in self.forgotten]
         self.documents.append([name for name in last if name in counting])
 
-    def choose_payload(self, second: State, payload: Mapping[str, Sequence[Entry]]) -> None:
+    def choose_payload(self, second: State, payload: Mapping[str, Sequence[FileEntry]]) -> None:
         """Choose payload that no document names, also none that does not count and stays."""
         going = {name for group in self.documents for name in group}
         records, damaged = read_records(self.store.place, second, going)

@@ -70,7 +70,7 @@ def report(
 
     A page whose bytes would be the same is not written, and that of a run whose inputs are the same is not rendered.
 
-    Raises `UsageError`: the path is none of these; `StoreError`: something cannot be read; all other pages of a store are written.
+    Raises `UsageError`: the path is something else; `StoreError`: something cannot be read; all other pages of a store are written.
 
     ``recipe`` is the current one: the page of a store sums over its runs. ``runs``: of a store, write the page of every run too.
     ``patches``: of a dataset, write pictures of all patches beside the page.

@@ -33,7 +33,7 @@ from tcpipe.pipeline.calls import (
 from tcpipe.pipeline.ingest import CallOptions, make_tasks
 from tcpipe.pipeline.log_sources import find_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, Step, plan
+from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, PlannedLog, plan
 from tcpipe.pipeline.problems import (
     find_incomplete_maps,
     find_incomplete_runs,
@@ -77,7 +77,7 @@ class Status:
 
     store: str
     to_do_now: str
-    """What somebody should do now, as one line."""
+    """Next action for the user, as one line."""
     sources: tuple[str, ...]
     counts: Mapping[LogState, int]
     """Logs by state."""
@@ -227,10 +227,10 @@ def _count_logs(logs: Sequence[str]) -> str:
     return f"{len(logs)} log{'s' * (len(logs) != 1)}"
 
 
-def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:
-    """Yield the logs that lie there for more than two nights and were never ingested.
+def _find_waiting(steps: Iterable[PlannedLog]) -> Iterator[Problem]:
+    """Yield the logs that arrived more than two nights ago and were never ingested.
 
-    Since when is told by the file system, not by the modification time, which a copy may keep.
+    The file system states the time of arrival, since a copy may keep the modification time.
     """
     before_ns = time.time_ns() - _TWO_NIGHTS_NS
     for step in steps:
@@ -238,9 +238,9 @@ def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:
             yield make_waiting(step.task.source, step.state)
 
 
-def _iterate_groups(steps: Iterable[Step]) -> Iterator[Group]:
+def _iterate_groups(steps: Iterable[PlannedLog]) -> Iterator[Group]:
     """Yield logs of one state with findings of the same codes on the same subjects; without findings, of the same cause."""
-    groups: dict[tuple[LogState, Hashable], list[Step]] = {}
+    groups: dict[tuple[LogState, Hashable], list[PlannedLog]] = {}
     for step in steps:
         alike = frozenset(
             (finding.code, None if finding.subject.kind in ("log", "run") else finding.subject)

@@ -89,7 +89,7 @@ class Verified:
 def verify(path: Path | str, *, store: Path | str = "tcpipe-store") -> Verified:
     """Re-read a dataset, a store, a map, a model or a cost map, all but a map also at a URL; or a run of a ``store`` by its name.
 
-    Raises `UsageError`: the path is none of these.
+    Raises `UsageError`: the path is something else.
     """
     kind, findings = _find_kind(path, store)
     read: dict[str, int] = {}

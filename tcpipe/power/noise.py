@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.rails import Rail, Samples, interpolate_rail, sum_power
+from tcpipe.power.rails import Rail, SampledSignal, interpolate_rail, sum_power
 from tcpipe.power.sampling import estimate_smoothing_variance
 from tcpipe.robust import solve_non_negative
 from tcpipe.tables.facts import Smoothing
@@ -82,12 +82,12 @@ def estimate_energy_noise(
     return EnergyNoise(rate, current, voltage)
 
 
-def compute_median_period_s(signal: Samples) -> float:
+def compute_median_period_s(signal: SampledSignal) -> float:
     """Return the median time between samples [s]; infinite with fewer than two."""
     return float(np.median(np.diff(signal.stamp_ns))) * _NS if len(signal.stamp_ns) > 1 else np.inf
 
 
-def estimate_resolution(signal: Samples) -> float:
+def estimate_resolution(signal: SampledSignal) -> float:
     """Return the quantisation step of a record, in its own unit; 0 where none shows (most values differ)."""
     levels = np.unique(signal.value)
     return float(np.median(np.diff(levels))) if 1 < len(levels) < 0.5 * len(signal.value) else 0.0
@@ -99,7 +99,7 @@ def _is_inside(at_ns: Stamps, start_ns: Stamps, end_ns: Stamps) -> Mask:
 
 
 def _estimate_integral_variance(
-    signal: Samples, start_ns: Stamps, end_ns: Stamps, still_ns: Stamps, *, averaged: bool, rate_hz: float | None
+    signal: SampledSignal, start_ns: Stamps, end_ns: Stamps, still_ns: Stamps, *, averaged: bool, rate_hz: float | None
 ) -> tuple[Floats, Floats]:
     """Return the variance of the signal's time integral over each span, in its unit squared times s², shape (M,).
 
@@ -141,7 +141,7 @@ def _sum_squared_shares(variance: Floats, edge_s: Floats, start_s: Floats, end_s
     return np.where(first < last, sums + divided, variance[first] * (end - begin) ** 2)
 
 
-def _estimate_rounding(signal: Samples, start_ns: Stamps, end_ns: Stamps) -> Floats:
+def _estimate_rounding(signal: SampledSignal, start_ns: Stamps, end_ns: Stamps) -> Floats:
     """Return the variance of a signal that stays on one level of its resolution, shape (M,): all its samples have one error."""
     changes = np.append(0, np.cumsum(np.diff(signal.value) != 0))
     first, last = (changes[np.maximum(np.searchsorted(signal.stamp_ns, at) - 1, 0)] for at in (start_ns, end_ns))
@@ -194,7 +194,7 @@ class SignalModel:
         return np.maximum(2.0 * (self.variance * self.tau_s**2) @ (squares - products), 0.0)
 
 
-def fit_signal_model(signal: Samples, steady: Mask, still: Mask, *, averaged: bool) -> SignalModel:
+def fit_signal_model(signal: SampledSignal, steady: Mask, still: Mask, *, averaged: bool) -> SignalModel:
     """Return the model of a signal by its ``steady`` samples, shape (N,), or by all where these are too few.
 
     ``still`` are the samples of a stationary robot, shape (N,), where all scatter is error. Of ``averaged`` signals a sample is the mean
@@ -218,7 +218,9 @@ def fit_signal_model(signal: Samples, steady: Mask, still: Mask, *, averaged: bo
     return SignalModel(error, size @ _PROCESSES, period_s * _TAU, float(size @ shown[:, 0]), slope_variance)
 
 
-def estimate_local_scale(model: SignalModel, signal: Samples, steady: Mask, start_ns: Stamps, end_ns: Stamps) -> Floats:
+def estimate_local_scale(
+    model: SignalModel, signal: SampledSignal, steady: Mask, start_ns: Stamps, end_ns: Stamps
+) -> Floats:
     """Return the ratio of the processes' variance near each span to that of the record, shape (M,).
 
     Near are the steady samples from 2 s before to 2 s after the span; the whole record counts as 4 samples.
@@ -233,7 +235,7 @@ def estimate_local_scale(model: SignalModel, signal: Samples, steady: Mask, star
     return np.asarray(np.maximum((here - model.error_variance) / model.curvature_variance, _MIN_SCALE))
 
 
-def compute_curvature(signal: Samples) -> Floats:
+def compute_curvature(signal: SampledSignal) -> Floats:
     """Return each inner sample's squared deviation from the line through its neighbours, as the variance of one sample, shape (N - 2,)."""
     t, x = signal.stamp_ns, signal.value
     right = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
@@ -241,7 +243,7 @@ def compute_curvature(signal: Samples) -> Floats:
     return np.asarray(off_line**2 / (1.0 + right**2 + (1.0 - right) ** 2))
 
 
-def _estimate_error_variance(signal: Samples, still: Mask, period_s: float, *, averaged: bool) -> float | None:
+def _estimate_error_variance(signal: SampledSignal, still: Mask, period_s: float, *, averaged: bool) -> float | None:
     """Return the variance of a sample against its neighbours: the median of calm sections of a stationary robot.
 
     If no section of the record is stationary throughout, it is that of the calmest twentieth of means, and unknown of samples.
@@ -256,7 +258,7 @@ def _estimate_error_variance(signal: Samples, still: Mask, period_s: float, *, a
     return float(np.quantile(means, 0.05)) if averaged and means.size else None
 
 
-def _compute_second_differences(signal: Samples, steady: Mask, period_s: float) -> Floats:
+def _compute_second_differences(signal: SampledSignal, steady: Mask, period_s: float) -> Floats:
     """Return spacings, the variance that second differences at each show for one sample, and the weight of each, shape (3, S)."""
     found, x, t = list[tuple[int, float, float]](), signal.value, signal.stamp_ns
     unsteady = np.append(0, np.cumsum(~steady))

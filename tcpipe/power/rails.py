@@ -32,7 +32,7 @@ _PERIODS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
+class SampledSignal:
     """One measured signal: stamps [ns], shape (N,), int64, strictly increasing, and values, shape (N,)."""
 
     stamp_ns: Stamps
@@ -61,25 +61,25 @@ class Rail:
     """
 
     name: str
-    voltage: Samples
-    current: Samples
+    voltage: SampledSignal
+    current: SampledSignal
     averaged: bool
     stamp_ns: Stamps
     voltage_volt: Floats
     current_amp: Floats
 
 
-def make_samples(stamp_ns: Stamps, value: Floats) -> Samples:
+def make_samples(stamp_ns: Stamps, value: Floats) -> SampledSignal:
     """Return the finite values in time order; of several at one stamp the first given, as for every other sensor.
 
     Of means the second says nothing: no time lies between it and the first.
     """
     known = np.isfinite(value)
     stamps, first = np.unique(stamp_ns[known], return_index=True)
-    return Samples(stamps, value[known][first])
+    return SampledSignal(stamps, value[known][first])
 
 
-def make_rail(name: str, voltage: Samples, current: Samples, *, averaged: bool) -> Rail:
+def make_rail(name: str, voltage: SampledSignal, current: SampledSignal, *, averaged: bool) -> Rail:
     """Return a rail of its voltage [V] and current [A], with both signals on the union of their stamps."""
     union = np.union1d(voltage.stamp_ns, current.stamp_ns)
     if not len(voltage.stamp_ns) or not len(current.stamp_ns):
@@ -92,7 +92,7 @@ def make_rail(name: str, voltage: Samples, current: Samples, *, averaged: bool) 
     return Rail(name, voltage, current, averaged, union, volt, amp)
 
 
-def interpolate_value(signal: Samples, at_ns: Stamps, *, averaged: bool) -> Floats:
+def interpolate_value(signal: SampledSignal, at_ns: Stamps, *, averaged: bool) -> Floats:
     """Return a signal of at least one sample at each time, shape (M,), by the one rule; its ends are held beyond them."""
     if averaged:
         ends_at = np.searchsorted(signal.stamp_ns, at_ns, side="left")
@@ -104,7 +104,7 @@ def interpolate_rail(each: Rail, at_ns: Stamps) -> tuple[Floats, Floats]:
     """Return voltage [V] and current [A] of a rail at each time, shape (M,), ends held; NaN if they are never both known."""
     if not len(each.stamp_ns):
         return np.full(len(at_ns), np.nan), np.full(len(at_ns), np.nan)
-    volt, amp = (Samples(each.stamp_ns, value) for value in (each.voltage_volt, each.current_amp))
+    volt, amp = (SampledSignal(each.stamp_ns, value) for value in (each.voltage_volt, each.current_amp))
     return interpolate_value(volt, at_ns, averaged=each.averaged), interpolate_value(amp, at_ns, averaged=each.averaged)
 
 
@@ -117,12 +117,12 @@ def compute_power_watt(rails: list[Rail], at_ns: Stamps) -> Floats:
     return total
 
 
-def sum_power(rails: list[Rail]) -> Samples | None:
+def sum_power(rails: list[Rail]) -> SampledSignal | None:
     """Return the power of all rails [W] at the first one's currents; None without rails, or if a rail is never known."""
     if not rails or not all(len(each.stamp_ns) for each in rails):
         return None
     stamp_ns = rails[0].current.stamp_ns
-    return Samples(stamp_ns, compute_power_watt(rails, stamp_ns))
+    return SampledSignal(stamp_ns, compute_power_watt(rails, stamp_ns))
 
 
 def compute_power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tuple[Floats, Floats, Floats]:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.rails import Rail, Rule, Samples, integrate_energy
+from tcpipe.power.rails import Rail, Rule, SampledSignal, integrate_energy
 from tcpipe.tables.facts import Smoothing
 from tcpipe.tables.findings import read_threshold
 
@@ -130,7 +130,7 @@ def is_stated_averaged(
     if power_ns.size < _FEWEST:
         return None
     period_s = float(np.median(np.diff(power_ns))) / 1e9
-    power, motion = Samples(power_ns, power_watt), np.column_stack((forward_mps, yaw_rate_radps, forward_mps**2))
+    power, motion = SampledSignal(power_ns, power_watt), np.column_stack((forward_mps, yaw_rate_radps, forward_mps**2))
     fit = make_power_fit(power, motion_ns, motion, averaged=False, margin_s=2.0 * period_s)
     if fit is None:
         return None
@@ -190,7 +190,7 @@ class PowerFit:
 
 
 def make_power_fit(
-    power: Samples, motion_ns: Stamps, motion: Floats, *, averaged: bool, margin_s: float
+    power: SampledSignal, motion_ns: Stamps, motion: Floats, *, averaged: bool, margin_s: float
 ) -> PowerFit | None:
     """Return the power samples that have known motion around them; None for fewer than 60.
 
@@ -265,7 +265,7 @@ def find_smoothing(fit: PowerFit, *, corrected_s: float = 0.0) -> Smoothing | No
     return tried[int(np.argmin(unexplained))] if min(unexplained) <= limit else None
 
 
-def estimate_smoothing_variance(power: Samples, steady: NDArray[np.bool_], smoothing: Smoothing) -> float:
+def estimate_smoothing_variance(power: SampledSignal, steady: NDArray[np.bool_], smoothing: Smoothing) -> float:
     """Return the variance of power [W²] that smoothing hides, by how smoothed power [W] changes while ``steady``, shape (N,)."""
     at_s = (power.stamp_ns - power.stamp_ns[0]) / 1e9
     earlier_s = at_s - smoothing.width_s

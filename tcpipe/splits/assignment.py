@@ -130,7 +130,7 @@ def draw_groups(
 
 
 def _take(tests: Mask, free: Ints, sizes: Ints, *, wanted: float) -> None:
-    """Let groups in ``free``, which are sorted by rank, join ``tests`` while that brings their share nearer to ``wanted``."""
+    """Add groups in ``free``, which are sorted by rank, to ``tests`` while that brings their share nearer to ``wanted``."""
     has_samples = sizes > 0
     taken, left = int(sizes[tests].sum()), int((has_samples & ~tests).sum())
     for group in free[~tests[free]].tolist():
@@ -183,7 +183,7 @@ class Assignment:
 
     @classmethod
     def from_names(cls, split: Names, fold: NDArray[np.signedinteger]) -> Assignment:
-        """Return an assignment by the names of splits; "" where there is none."""
+        """Return an assignment by the names of splits; "" for none."""
         order = np.argsort(_NAMES)
         return cls(order[np.searchsorted(_NAMES, split, sorter=order)].astype(np.uint8), fold.astype(np.int8))
 

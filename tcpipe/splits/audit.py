@@ -49,7 +49,7 @@ def audit_leakage(
     chord_m : segment length [m]; samples follow one another if their centres are at most 1.5 chords apart.
     """
     neighbours = _count_neighbours(train, run, start_ns, corners_xy_m, chord_m=chord_m)
-    ground = Ground(corners_xy_m, np.flatnonzero(train))
+    ground = Footprints(corners_xy_m, np.flatnonzero(train))
     return tuple(_audit_split(name, np.flatnonzero(is_held), run, ground, neighbours) for name, is_held in held.items())
 
 
@@ -66,7 +66,7 @@ def _count_neighbours(train: Mask, run: Ints, start_ns: Ints, corners_xy_m: Floa
     return found
 
 
-class Ground:
+class Footprints:
     """Ground of footprints ``rows`` among all, whose corners are in order around each square, shape (N, 4, 2) [m]."""
 
     def __init__(self, corners_xy_m: Floats, rows: Ints) -> None:
@@ -79,7 +79,7 @@ class Ground:
         self.tree = cKDTree(centres)
 
 
-def _audit_split(name: str, held: Ints, run: Ints, train: Ground, neighbours: Ints) -> HeldOut:
+def _audit_split(name: str, held: Ints, run: Ints, train: Footprints, neighbours: Ints) -> HeldOut:
     pairs, apart_m = 0, [np.empty(0)]
     shares, repeats = np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
     for part in _split_points(np.arange(len(held)), _CHUNK) if len(train.rows) else []:
@@ -147,7 +147,7 @@ def compute_shared_fraction(queries: Floats, references: Floats, i: Ints, j: Int
     return np.asarray(shared_m2 / shapely.area(ours)[i])
 
 
-def compute_nearest_m(queries: Floats, ground: Ground) -> Floats:
+def compute_nearest_m(queries: Floats, ground: Footprints) -> Floats:
     """Return the distance from each of ``queries``, corners (N, 4, 2), to the nearest of the ground [m], (N,); empty if either is."""
     count = len(ground.rows)
     if len(queries) == 0 or count == 0:

@@ -207,7 +207,7 @@ def _is_constant(values: Array) -> bool:
 
 
 def _sort_columns(columns: Arrays) -> Arrays:
-    """Return the columns in the order of log time; messages of equal times as they lie in the log."""
+    """Return the columns in the order of log time; messages of equal times keep their order in the log."""
     log_time_ns = columns[LOG_TIME]
     if not (np.diff(log_time_ns) < 0).any():
         return columns

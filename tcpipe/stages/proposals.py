@@ -1,7 +1,7 @@
-"""What a log could be read as by a recipe: fixes, inertial measurements and power in messages that no rule knows, judged by their values.
+"""Proposals for a recipe: fixes, inertial measurements and power in unknown messages, by names and values.
 
-`tcpipe inspect`, `preflight`, `ingest` and `init --from` all have it from here. A proposal whose values cannot be what its names say is not
-made; one that the values do not settle says in ``doubt`` what remains to be checked.
+`tcpipe inspect`, `preflight`, `ingest` and `init --from` use them. Values that contradict the names exclude a proposal; ``doubt`` states
+what remains to be checked.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _GRAVITY_MPS2 = UNITS["m/s2"]["g"]
 _UNSETTLED: Keys = {"sign": "auto", "averaging_unknown": True}
-"""What no name says of a current."""
+"""Keys of a current that its name does not determine."""
 
 
 def find_proposals(

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import RoleError
-from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, RECIPE, AlignedClocks, Timeline, TopicTimes, settle_clocks
+from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, RECIPE, AlignedClocks, TopicTimeline, TopicTimes, settle_clocks
 from tcpipe.logs.field_mapping import find_topic
 from tcpipe.logs.roles import MOTION_ROLES, RoleAssignment, assign_roles
 from tcpipe.logs.topics import Topic, find_missing_roles
@@ -153,7 +153,7 @@ def _read_times(source: TopicReadings, config: ReadConfig) -> TopicTimes:
 
 
 def make_role_table(
-    role: str, sources: Sequence[TopicReadings], timelines: Mapping[str, Timeline], power: PowerReadings
+    role: str, sources: Sequence[TopicReadings], timelines: Mapping[str, TopicTimeline], power: PowerReadings
 ) -> pa.Table:
     """Return a role's table, sorted by epoch and stamp; the columns of its sources' readings are taken out."""
     parts = []
@@ -167,7 +167,7 @@ def make_role_table(
     return STREAMS[role].table(**{name: columns.pop(name)[order] for name in list(columns)})
 
 
-def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> list[Arrays]:
+def _read_parts(source: TopicReadings, timeline: TopicTimeline, power: PowerReadings) -> list[Arrays]:
     """Return a topic's columns; one part a rail where it is used as power."""
     readings = source.readings.columns
     columns = {name: readings.pop(name)[timeline.row] for name in list(readings)}
@@ -235,7 +235,7 @@ def make_read_report(
     return StageReport(tuple(dict.fromkeys(findings)), facts)
 
 
-def _find_unused(source: TopicReadings, timeline: Timeline | None) -> Iterator[Finding]:
+def _find_unused(source: TopicReadings, timeline: TopicTimeline | None) -> Iterator[Finding]:
     """Yield the finding that many messages are not used; the numbers count them by reason."""
     dropped = source.readings.dropped | (timeline.dropped if timeline is not None else {})
     counts = {f"{reason}_count": count for reason, count in dropped.items() if reason not in _EXPECTED}
@@ -246,7 +246,7 @@ def _find_unused(source: TopicReadings, timeline: Timeline | None) -> Iterator[F
         yield make_finding("messages-unused", Subject("role", source.role), names=names, **numbers)
 
 
-def _find_clock(source: TopicReadings, timeline: Timeline, *, is_simulated: bool) -> Iterator[Finding]:
+def _find_clock(source: TopicReadings, timeline: TopicTimeline, *, is_simulated: bool) -> Iterator[Finding]:
     """Yield the findings on a topic's stamps: that log time is used, that some were replaced, that all were moved."""
     role, names = Subject("role", source.role), {"topic": source.topic}
     by_simulation = is_simulated and timeline.source == "log" and any(timeline.moved_s)
@@ -260,7 +260,7 @@ def _find_clock(source: TopicReadings, timeline: Timeline, *, is_simulated: bool
             yield make_finding("topic-clock-offset", role, names=names, moved_s=moved_s, clock_epoch=epoch)
 
 
-def _make_topic_facts(source: TopicReadings, timeline: Timeline) -> TopicFacts:
+def _make_topic_facts(source: TopicReadings, timeline: TopicTimeline) -> TopicFacts:
     period_ns = np.diff(timeline.stamp_ns)[np.diff(timeline.clock_epoch) == 0]
     return TopicFacts(
         type=source.type_name,

@@ -213,7 +213,7 @@ Values = Mapping[str, NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True)
-class Repeats:
+class RepeatedValues:
     """The rates [Hz] of the messages that carry a rail's current or voltage, and of the readings that they repeat."""
 
     rail: str
@@ -222,7 +222,7 @@ class Repeats:
     reading_hz: float
 
 
-def remove_repeats(streams: Streams) -> tuple[Streams, list[Repeats]]:
+def remove_repeats(streams: Streams) -> tuple[Streams, list[RepeatedValues]]:
     """Return the streams with only the readings of power, and what was repeated; a table that repeats none stays as it is.
 
     A reading has the stamp of the first message that holds it.
@@ -236,7 +236,7 @@ def remove_repeats(streams: Streams) -> tuple[Streams, list[Repeats]]:
     at_ns = np.concatenate(([0], np.cumsum(step_ns)))
     values = {quantity: to_floats(power, column) for quantity, column in _QUANTITIES.items()}
     kept = {quantity: np.isfinite(value) for quantity, value in values.items()}
-    repeats: list[Repeats] = []
+    repeats: list[RepeatedValues] = []
     for rail in pc.unique(power["rail"]).to_pylist():
         rows = np.flatnonzero(to_texts(power["rail"]) == rail)
         for quantity in _QUANTITIES:
@@ -244,7 +244,7 @@ def remove_repeats(streams: Streams) -> tuple[Streams, list[Repeats]]:
             readings = _find_readings(at_ns, own, quantity, values)
             if readings is not None:
                 kept[quantity][np.setdiff1d(own, readings)] = False
-                repeats.append(Repeats(rail, quantity, _rate_hz(at_ns[own]), _rate_hz(at_ns[readings])))
+                repeats.append(RepeatedValues(rail, quantity, _rate_hz(at_ns[own]), _rate_hz(at_ns[readings])))
     if not repeats:
         return streams, []
     columns = {name: power[name] for name in power.column_names}
@@ -268,7 +268,7 @@ def _rate_hz(at_ns: NDArray[np.int64]) -> float:
     return 1e9 / float(np.mean(step_ns[step_ns < 1.5 * np.median(step_ns)]))
 
 
-def find_repeats(repeats: Sequence[Repeats]) -> Iterator[Finding]:
+def find_repeats(repeats: Sequence[RepeatedValues]) -> Iterator[Finding]:
     """Yield the finding that messages repeat readings, by the slowest of them; labelling finds whether that is too slow."""
     if not repeats:
         return

@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from tcpipe.errors import MapError, RecipeError, RoleError
 from tcpipe.geometry.rotation import quat_from_rpy
-from tcpipe.logs.clocks import Timeline
+from tcpipe.logs.clocks import TopicTimeline
 from tcpipe.logs.expressions import UNITS
 from tcpipe.logs.extrinsics import IDENTITY, Pose, Tree, build_static_tree, find_base_link_from, is_base
 from tcpipe.logs.field_mapping import MAPPED_TYPES, Columns, make_mapped_message
@@ -200,7 +200,7 @@ def place_sensors(
     tables: Mapping[str, pa.Table],
     assignment: RoleAssignment,
     sources: Sequence[TopicReadings],
-    timelines: Mapping[str, Timeline],
+    timelines: Mapping[str, TopicTimeline],
     *,
     config: ReadConfig,
 ) -> tuple[dict[str, Sensor], list[Finding]]:

@@ -165,10 +165,10 @@ STACKS: dict[Stack, type[np.generic]] = {
     "greys": np.uint8,
     "classes": np.uint8,
 }
-"""What layers of the map's own pixels are sampled together, and their type in a map."""
+"""Layers of the map's own pixels that are sampled together, and their type in a map."""
 
 MAX_BANDS = 512
-"""Of one layer."""
+"""Largest number of bands of one layer."""
 
 HEIGHT_STEP_M = 0.0005
 """One step of a stored height [m]."""
@@ -184,7 +184,7 @@ LUMA_RGB = (0.299, 0.587, 0.114)
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _TAKEN = (*LAYERS, *COLOURS, *("classes", "row", "column", "sample", "spatial_ref", "x", "y", "overviews"))
-"""What else a map or a dataset calls by name; the columns of samples are taken, too."""
+"""Names that layers must not have, besides those of columns of samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,18 +200,18 @@ class Layer:
     """Type in a patch."""
     unit: str = "1"
     step: float = 1.0
-    """What one stored number is worth [unit]."""
+    """Step of a stored number [unit]."""
     low: float = 0.0
     high: float = 1.0
-    """What becomes 0 and 1 in the tensor [unit]."""
+    """Values that become 0 and 1 in the tensor [unit]."""
     classes: ClassTable | None = None
-    """Of a categorical layer."""
+    """Class table of a categorical layer."""
     bands: tuple[tuple[float, float], ...] = ()
-    """What becomes 0 and 1 of each band [unit], of a layer of several."""
+    """Values of each band that become 0 and 1, of a layer of several bands [unit]."""
     pixel_size_m: float = 0.0
-    """Of a layer of several bands: side of its own pixels in the map [m]."""
+    """Pixel size in the map of a layer of several bands [m]."""
     own_px: int = 0
-    """Of a layer of several bands: side of its patches in pixels of its own, a divisor of that of the tensor."""
+    """Side of the patches of a layer of several bands [px], a divisor of that of the tensor."""
 
     def patch_shape(self, patch_px: int) -> tuple[int, ...]:
         """Return the shape of a stored patch: (px, px), or (bands, own px, own px)."""
@@ -235,7 +235,7 @@ class Layer:
 
     @property
     def signature(self) -> str:
-        """What layers of one name have in common wherever patches of them go together, but for classes."""
+        """Properties, other than classes, that layers of one name share wherever their patches are used together."""
         return f"{self.kind} [{self.unit}]" + (
             f", {len(self.bands)} bands, {self.own_px} px a patch" * bool(self.bands)
         )

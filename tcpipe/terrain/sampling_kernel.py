@@ -18,11 +18,11 @@ from tcpipe.terrain.layers import HEIGHT_NODATA
 
 
 class Tiles(NamedTuple):
-    """Tiles in memory, one after another; layers of a kind follow each other, and there may be none of it.
+    """Tiles in memory, one after another; layers of a kind follow each other.
 
     ``relative`` is float32 [m] with NaN as no data, shape (S,); ``floats`` the same, (F·S,); ``greys`` and ``classes`` are uint8 with 0 as
-    no data, (G·S,), (C·S,). ``slots`` says which of them is the tile in row i and column j of the map, (A, B), -1 where there is none,
-    which is ground without data; ``rows`` and ``cols`` are the pixels of a tile.
+    no data, (G·S,), (C·S,). ``slots`` is the number of the tile in row i and column j of the map, (A, B), -1 for ground
+    without data; ``rows`` and ``cols`` are the pixels of a tile.
     """
 
     relative: NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""What a map offers to be sampled from, and a pool that decodes each of its tiles once while samples come tile by tile."""
+"""Interface of a map for sampling, and a pool that decodes each of its tiles once while samples come tile by tile."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class MapReader(ABC):
     tile_px: int
     """Side of the square tiles that are cheap to read, aligned with pixel (0, 0)."""
     height_reference_m: float
-    """What stored heights are above [m]."""
+    """Reference of the stored heights [m]."""
     factors: tuple[int, ...]
     """Levels that `at` gives: how many pixels of the full map a pixel of each spans, rising from 1."""
     banded: Mapping[str, BandReader]
@@ -94,7 +94,7 @@ def choose_level(source: MapReader, pixel_size_m: float) -> MapReader:
 
 
 def find_map_projection(source: MapReader, gnss_crs: str) -> Projection:
-    """Return the operation from the longitudes and latitudes of a geographic CRS to the map's CRS; `MapError` where one of them is none."""
+    """Return the operation from the longitudes and latitudes of a geographic CRS to the map's CRS; `MapError` if one is not valid."""
     crs = parse_crs(source.grid.crs, where=f"map {source.name}")
     return Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, compute_area(crs, source.grid.bounds_m))
 

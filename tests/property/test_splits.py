@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from splits_squares import squares
 
 from tcpipe.splits.assignment import NO_FOLD, Assignment, Groups, assign_splits, draw_groups, hash_ranks
-from tcpipe.splits.audit import Ground, audit_leakage, compute_nearest_m, compute_shared_fraction, find_near_pairs
+from tcpipe.splits.audit import Footprints, audit_leakage, compute_nearest_m, compute_shared_fraction, find_near_pairs
 from tcpipe.splits.regions import Regions, Side, classify_footprints
 
 
@@ -170,7 +170,7 @@ def test_distance_and_shared_ground_are_those_of_shapely(seed, n, m, extent_m):
         squares(rng.uniform(0, extent_m, (count, 2)), rng.uniform(-np.pi, np.pi, count)) for count in (n, m)
     )
     a, b = shapely.polygons(ours)[:, None], shapely.polygons(theirs)[None]
-    ground = Ground(theirs, np.arange(m))
+    ground = Footprints(theirs, np.arange(m))
     np.testing.assert_allclose(compute_nearest_m(ours, ground), shapely.distance(a, b).min(axis=1), atol=1e-9)
     shared = np.zeros((n, m))
     i, j = find_near_pairs(ours.mean(axis=1), ground.tree, within_m=np.sqrt(2) + 1e-9)

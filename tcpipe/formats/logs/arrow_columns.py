@@ -38,11 +38,11 @@ from tcpipe.logs.wire_types import (
 from tcpipe.tables.columns import number_column
 
 FLUSH_BYTES = 1 << 21
-"""Payloads are turned into columns when about this much has gathered: it still lies in the cache."""
+"""Size of the payloads that are converted to columns together [byte]; they fit into the processor's cache."""
 MIN_GROUP = 512
 """Fewer messages of equal length, among others, are not worth a walk of their own."""
 MAX_REFUSED = 20_000
-"""Of a topic's messages that a walk does not fit, so many are refused one by one."""
+"""Most messages of a topic that are rejected one by one because they do not fit their definition."""
 MAX_CONTIGUOUS_BYTES = 1 << 30
 """A larger table stays in pieces: Arrow's lists and strings count their values in 31 bits."""
 

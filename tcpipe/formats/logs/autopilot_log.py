@@ -51,7 +51,7 @@ Layout = np.dtype[np.void]
 
 
 @dataclass(slots=True)
-class Messages:
+class AutopilotMessages:
     """Messages of one name and instance, in order of time since boot [µs], with the offsets in the file at which their fields begin.
 
     ``scales`` are by field: what one of a whole number is in the field's unit.
@@ -93,7 +93,7 @@ class AutopilotRecords:
 
     path: Path
     data: bytes
-    messages: dict[str, Messages] = field(default_factory=dict)
+    messages: dict[str, AutopilotMessages] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
     damage: dict[Damage, None] = field(default_factory=dict)
     skipped: dict[str, Damage] = field(default_factory=dict)
@@ -128,7 +128,9 @@ class AutopilotRecords:
         if len(self.messages) >= MAX_TOPICS:
             raise LogError(f"{self.path}: it contains more than {MAX_TOPICS} topics; no such log is read")
         stamps = _gather_field(self.data, offsets, layout, clock) * _CLOCKS[clock]
-        self.messages[f"{name}_{instance}" if instance else name] = Messages(name, layout, offsets, stamps, scales)
+        self.messages[f"{name}_{instance}" if instance else name] = AutopilotMessages(
+            name, layout, offsets, stamps, scales
+        )
 
     def sort_by_time(self) -> None:
         """Bring messages in order of time; those with a stamp far from those around it, or from the log's end, are left out and counted."""
@@ -255,7 +257,7 @@ class _UlogReader:
         return at >= len(self._data) or (at + 3 <= len(self._data) and self._data[at + 2] in _ULOG_KINDS)
 
     def _find_next(self, start: int) -> int:
-        """Return the offset of the next message of a known topic; the size of the file if there is none."""
+        """Return the offset of the next message of a known topic; the size of the file without one."""
         at = self._data.find(_DATA, start + 2)
         while 0 <= at <= len(self._data) - 3:
             size, _, number = _ULOG_HEAD.unpack_from(self._data, at - 2)
@@ -375,7 +377,11 @@ def _read_dataflash(records: AutopilotRecords) -> None:
             records.add_damage("messages-not-decoded", f"/{name}", len(starts), reason=reason)
         elif len(starts) and name not in _WITHOUT_TIME:
             _add_instances(records, name, layout, starts, scales)
-        columns = Messages(name, layout, starts, starts, scales).read_columns(data) if name in ("PARM", "DSF") else {}
+        columns = (
+            AutopilotMessages(name, layout, starts, starts, scales).read_columns(data)
+            if name in ("PARM", "DSF")
+            else {}
+        )
         if name == "PARM" and [columns[key].dtype.str for key in ("Name", "Value") if key in columns] == [
             "|S16",
             "<f4",
@@ -387,7 +393,7 @@ def _read_dataflash(records: AutopilotRecords) -> None:
 
 
 def _find_message(data: bytes, start: int, lengths: list[int]) -> int:
-    """Return the offset of the next message that precedes another one or the end of the file; the file's size if there is none."""
+    """Return the offset of the next message that precedes another one or the end of the file; the size of the file without one."""
     at = data.find(_HEAD, start)
     while at >= 0 and at + 2 < len(data):
         end = at + lengths[data[at + 2]]

@@ -203,16 +203,16 @@ _INDEX_ENTRY_BYTES = 12
 _INDEX_HEAD_BYTES = 64
 """As much as an index record's header takes as a rule, and the length behind it."""
 _PLACED_AT_ONCE = 1024
-"""Of so many chunks the heads are looked at together."""
+"""Number of chunks whose headers are read together."""
 _EXPECTED_BYTES = 1 << 24
 """An index is seldom longer, and a broken header may place it anywhere."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Chunk:
-    """A chunk, and how many messages of each connection it holds; ``counts`` is None where only its records can tell.
+    """A chunk, and how many messages of each connection it contains; ``counts`` is None if only its records show them.
 
-    ``record`` is what lies at ``offset`` (None where it is not read yet, or broken), ``size`` what its records take [byte].
+    ``record`` is the record at ``offset`` (None before it is read, or if it is damaged), ``size`` that of its records [byte].
     """
 
     offset: int

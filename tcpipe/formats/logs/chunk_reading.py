@@ -52,9 +52,9 @@ class Entries:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Chunks to read at once: their numbers in the group, and the wanted messages (None: only the chunk's records can tell).
+    """Chunks to read at once: their numbers in the group, and the wanted messages (None: only the chunk's records show them).
 
-    Of a ``compact`` one only the pieces with wanted messages are kept; others are single chunks, kept whole.
+    A ``compact`` one keeps only the pieces with wanted messages; others are single chunks, kept whole.
     """
 
     chunks: range
@@ -317,7 +317,7 @@ def sort_by_place(
     *,
     least_bytes: int,
 ) -> tuple[Entries, NDArray[np.bool_]]:
-    """Return index entries (shape (N,) each) in the order in which they lie in chunks of ``sizes`` bytes, and which chunks' are sound.
+    """Return index entries (shape (N,) each) in their order in chunks of ``sizes`` bytes, and which chunks' are sound.
 
     Of those that are not, a message would begin outside the chunk, or have less than ``least_bytes`` before the next.
     """

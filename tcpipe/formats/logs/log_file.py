@@ -73,9 +73,9 @@ _KNOWN_MAGIC = (
 
 
 def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Log:
-    """Open a .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; `LogError` says what else it is.
+    """Open a .mcap, .bag or .db3 file (by its content, not its name), or a ROS 2 bag directory; `LogError` names any other kind.
 
-    ``path`` may be the URL of one (``s3://…``): of an .mcap or .bag with an index only what is asked for is fetched, anything else is
+    ``path`` may be the URL of one (``s3://…``): of an .mcap or .bag with an index only the requested topics are fetched, any other is
     copied until the log is closed. ``message_definitions``: a directory of .msg files for types that the log does not define.
     """
     with ExitStack() as stack:
@@ -96,7 +96,7 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
 
 
 def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | None) -> LogPart:
-    """Open a file of a log until the stack ends; `LogError` where it is none, which says what it seems to be."""
+    """Open a file of a log until the stack ends; `LogError` names the probable kind of any other file."""
     magic, given = _read_magic(path, fetched), path
     if fetched is not None and not magic.startswith((mcap_records.MAGIC, bag_file.MAGIC)):
         fetched.whole()
@@ -238,7 +238,7 @@ class OpenLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the log; what goes wrong with one in object storage is told with its URL."""
+        """Close the log; errors of one in object storage name its URL."""
         self._stack.__exit__(kind, error, trace)
 
     def close(self) -> None:
@@ -252,7 +252,7 @@ class OpenLog:
 
     @property
     def size_and_time(self) -> list[list[int]]:
-        """Size [byte] and modification time [ns] of each file, by name: what tells whether a log is still the same."""
+        """Size [byte] and modification time [ns] of each file, by name: equal for an unchanged log."""
         found = [file.stat() for file in sorted(self.files, key=lambda file: file.name)]
         return [[stat.st_size, stat.st_mtime_ns] for stat in found]
 
@@ -269,7 +269,7 @@ class Log(OpenLog):
         self._fetched = tuple(opened.fetched.values())
         self._damage = list(opened.listed.damage)
         self.topics = self._merged_topics()
-        """Every topic by name, as the index tells."""
+        """Every topic by name, from the index."""
         self._compare_counts(opened.listed)
 
     def _compare_counts(self, listed: Rosbag2Files) -> None:
@@ -301,7 +301,7 @@ class Log(OpenLog):
 
     @property
     def is_known_by_outline(self) -> bool:
-        """Whether `sha256` is the outline: the log lies in object storage, and hashing it would take fetching all of it."""
+        """Whether `sha256` is the outline: the log is in object storage, and its hash would need all of its bytes."""
         return any(not file.is_whole for file in self._fetched) and bool(self.outline)
 
     def sha256(self) -> str:
@@ -360,9 +360,9 @@ class Log(OpenLog):
     def batches(self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES) -> Iterator[dict[str, pa.Table]]:
         """Yield the tables of several topics piece by piece, as `tables`, in memory that does not grow with the log.
 
-        Each dict holds the next rows of some topics (those that hold most); the last one names every topic. Rows are in the order of
-        log time, also from piece to piece, as long as no message lies in the log further than half a piece behind its time; `findings`
-        counts those that do. Some is yielded when more than ``batch_bytes`` are gathered over all topics; None yields everything at once.
+        Each dict has the next rows of some topics (those with most rows); the last one names every topic. Rows are in the order of log
+        time, also from piece to piece, unless a message is in the log more than half a piece behind its time; `findings` counts those. A
+        piece is yielded when more than ``batch_bytes`` are gathered over all topics; None yields everything at once.
         """
         collected = self._collectors(topics)
         most = math.inf if batch_bytes is None else batch_bytes

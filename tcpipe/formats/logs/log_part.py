@@ -1,4 +1,4 @@
-"""What every log container gives: channels, and blocks of serialised messages with their times.
+"""Interface of every log container: channels, and blocks of serialised messages with their times.
 
 A `LogPart` is one file of a log. `tcpipe.formats.logs.log_file` joins the parts of a log and turns their blocks into tables.
 """
@@ -26,8 +26,8 @@ from tcpipe.logs.topics import Damage, Topic
 MAX_CHUNK_BYTES = 1 << 29
 """A chunk that claims to hold more than this is taken for damaged: it is held as a whole. Writers make chunks of some megabytes."""
 _PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO, _PLAUSIBLE_CHUNK_RATIO = 1 << 26, 1000, 100
-"""What claims to hold more than both so many bytes and so many times its compressed size is taken for damaged: a bomb. A chunk or message
-is held as a whole, and more than once while it is decoded: of those less is believed than of a file."""
+"""Limits of decompressed data: size [byte] and ratio to the compressed size. Data that claim to exceed both are damaged (a bomb). The limit
+of a chunk or message is lower than that of a file, because it is in memory as a whole, and more than once while it is decoded."""
 MAX_CHUNKS = 1 << 20
 """A file of more chunks is refused: of chunks of a megabyte, as writers make them, this is a terabyte."""
 MAX_CHANNELS = 1 << 16
@@ -43,9 +43,9 @@ _LZ4_MAGIC, _LZ4_HAS_CONTENT_SIZE = b"\x04\x22\x4d\x18", 0x08
 _PEEK_BYTES = 1 << 13
 
 _BLOCK_BYTES = 1 << 13
-"""What is fetched begins and ends at multiples of this."""
+"""Fetched ranges begin and end at multiples of this [byte]."""
 _HELD_BLOCKS = (1 << 26) // _BLOCK_BYTES
-"""So much is held: more than a group of chunks that is planned at once."""
+"""Size of the buffer of fetched ranges [byte]: more than a group of chunks that is planned at once."""
 _GAP_BLOCKS = 4
 """Blocks no further apart are fetched as one piece: a request costs as much as some."""
 
@@ -88,7 +88,7 @@ class LogPart(Protocol):
     container: str
     """``mcap``, ``bag`` or ``rosbag2``."""
     damage: list[Damage]
-    """What was found damaged so far; the same place may be in it twice."""
+    """Damage that was found so far; it may have one place twice."""
 
     @property
     def channels(self) -> Mapping[int, Topic]:
@@ -100,7 +100,7 @@ class LogPart(Protocol):
 
     @property
     def outline(self) -> str:
-        """A hash (hex) of the file's size and index, which tell it from any other recording; "" where it has no index."""
+        """A hash (hex) of the file's size and index, which distinguish it from any other log; "" without an index."""
 
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels; what is broken is noted in ``damage`` and stepped over."""
@@ -290,7 +290,7 @@ def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:
 
 
 class Bounds:
-    """What one file may hold, by its size [byte]: `LogError` where it holds more, since it was made to take all memory or time."""
+    """Limit of the content of one file by its size [byte]: `LogError` above it, since such a file was made to use all memory or time."""
 
     def __init__(self, path: Path, size: int) -> None:
         self._path, self._size = path, size

@@ -141,7 +141,7 @@ class McapPart(ChunkedPart[Chunk]):
         return records, end
 
     def read_walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
-        """Return the wanted messages of a chunk by its records; where these end too early, or are none, that is noted."""
+        """Return the wanted messages of a chunk by its records; note damage if these end too early or cannot be parsed."""
         records, end = self._step_through(chunk, data)
         messages, _ = read_messages_at(data, find_message_offsets(data, records))
         every = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
@@ -172,7 +172,7 @@ class McapPart(ChunkedPart[Chunk]):
         return chunk.data_offset
 
     def _crc(self, chunk: Chunk) -> int:
-        """Return the CRC of a chunk's records; 0 where there is none."""
+        """Return the CRC of a chunk's records; 0 without one."""
         if chunk.headless:
             return 0
         return int.from_bytes(self._bytes.read(chunk.offset + CHUNK_CRC, 4), "little")

@@ -279,7 +279,7 @@ _SUMMARY_BYTES = 1 << 16
 
 @dataclass(slots=True)
 class Contents:
-    """What is known of a file so far."""
+    """Facts of a file that were read so far."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, ChannelRecord] = field(default_factory=dict)

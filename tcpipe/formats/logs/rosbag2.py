@@ -30,7 +30,7 @@ MAX_METADATA_BYTES = 1 << 20
 _COPY_BYTES = 1 << 22
 _LISTED = 10
 _PART = re.compile(r"(_\d+)?\.(db3|mcap)(\.zstd)?$")
-"""What the names of the files of a bag end with, and differ in."""
+"""End of the names of a bag's files, in which they differ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,7 @@ def _read_bag_information(path: Path) -> dict[str, Any] | None:
 
 
 def _describe_metadata_problem(path: Path) -> str:
-    """Say why a metadata.yaml tells nothing."""
+    """Describe why a metadata.yaml cannot be used."""
     if not path.is_file():
         return "is missing"
     size = path.stat().st_size

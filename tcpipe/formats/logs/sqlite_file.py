@@ -34,12 +34,12 @@ _BLOCK_ROWS, _BLOCK_BYTES = 4096, 1 << 23
 """A block ends after so many rows, or with the row that makes it longer than so many bytes."""
 _BEFORE_ALL, _LAST_ID = -1e19, 2**63 - 1
 _MOST_HOLES = 1000
-"""What is read of a file ends at so many broken pieces: each is searched for its end."""
+"""Most damaged ranges after which reading of a file ends: the end of each is searched."""
 _LONGEST_BYTES, _ROW_BYTES = 1 << 28, 1 << 10
 """SQLite refuses a row that claims to be longer, or longer than its file: a chain of pages may lead back to itself."""
 _TABLES = ("topics", "messages", "message_definitions")
 _BROKEN = (sqlite3.Error, UnicodeDecodeError, MemoryError)
-"""What a broken database raises; the second where even the name in its complaint is broken, the third where a row claims to be endless."""
+"""Errors of a damaged database; the second if the name in its message is damaged, the third if a row claims to be endless."""
 _Row = tuple[int, int, int, int, bytes]
 """Row id, topic, log time, publish time, data."""
 
@@ -238,7 +238,7 @@ class SqlitePart:
                 yield row
 
     def _first_behind(self, query: str, low: int) -> Any:
-        """Return the row of the first id above ``low`` from which on SQLite reads, found in steps that double; None where there is none."""
+        """Return the row of the first id above ``low`` from which on SQLite reads, found in steps that double; None without such a row."""
         step = 1
         while low + step <= _LAST_ID and self._first_from(query, low + step) is None:
             step *= 2
@@ -254,7 +254,7 @@ class SqlitePart:
         return self._first_from(query, found)
 
     def _first_from(self, query: str, number: int) -> Any:
-        """Return the first row with this id or a larger one; None where there is none, or where SQLite cannot read it."""
+        """Return the first row with this id or a larger one; None without one, or if SQLite cannot read it."""
         try:
             return self._database.execute(f"{query} AND id >= ? ORDER BY id LIMIT 1", (number,)).fetchone()
         except _BROKEN:

@@ -14,7 +14,7 @@ from tcpipe.formats.logs.rosbag2 import METADATA
 from tcpipe.recipe import TableMapping
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tum", ".pos", ".parquet")
-"""What a file of a table is called."""
+"""Suffixes of tables."""
 
 _DATASET = {"dataset.json", "samples.parquet"}
 """Files that identify a folder as a dataset."""
@@ -47,7 +47,7 @@ class TableRun:
 def find_table_logs(path: Path, mappings: Mappings) -> list[tuple[Path, ...]]:
     """Return the logs at or below a path that are tables, in order of their names.
 
-    A log is a folder that holds a mapped file, with what lies below it, or the files of a `TableRun`.
+    A log is a folder with a mapped file and all below it, or the files of a `TableRun`.
     """
     if path.is_file():
         return [run.files] if (run := find_table_run(path, mappings)) else []

@@ -285,7 +285,7 @@ def _read_beginning(path: Path) -> bytes:
 def _list_plain_files(path: Path, raster: Path | None = None) -> tuple[str, tuple[Path, ...]]:
     """Return a raster's driver and files, itself first; `MapError` if one of them names a file elsewhere or is too large.
 
-    ``raster`` is the one that it lies beside, if any.
+    ``raster`` is the raster to which it belongs, if any.
     """
     driver = _find_driver(path, raster or path)
     _refuse_beside(path)

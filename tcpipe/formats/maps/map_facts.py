@@ -1,9 +1,4 @@
-"""What is known of a map: what it is made from, what building it found, and what it is as a whole.
-
-What a raster says its values mean: its raster attribute table, or its category names.
-
-Layers as JSON values, in a dataset's card and in a map; as CF attributes, by which xarray decodes patches.
-"""
+"""Facts of a map: its inputs, the results of building it, its summary, and its layers as JSON values and CF attributes."""
 
 from __future__ import annotations
 

@@ -164,8 +164,7 @@ def _read_bands(  # noqa: PLR0917
 def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool = True) -> MapFile:
     """Open a map for reading; its shards are in the folders of their descriptions, or are ``fetched``.
 
-    `MapError`: there is none, it is not a map of this program, or, where that is to be ``proved``, its descriptions are not as they were
-    written or a file is gone: lost tiles would read as ground without data.
+    `MapError`: no map of this program; or, if ``proved``, changed descriptions or missing files: lost tiles would read as no data.
     """
     if not (path / DESCRIPTION).is_file():
         raise MapError(f"{path}: not a map, it has no {DESCRIPTION}; add one with: tcpipe add-map")

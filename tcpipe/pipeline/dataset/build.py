@@ -30,7 +30,7 @@ from tcpipe.formats.published_outputs import check_kind, fetch_directory_by_rang
 from tcpipe.formats.runs import Options, Output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, describe_error, estimate, list_ended_calls, record_call
-from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, find_other_options, plan_inputs, prove_maps
+from tcpipe.pipeline.dataset.inputs import ChosenInputs, choose_inputs, find_other_options, plan_inputs, prove_maps
 from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.options import BuildDatasetOptions
@@ -151,7 +151,7 @@ class _Job:
     """The inputs and planned work of one call."""
 
     marks: BuildOptions
-    inputs: Inputs
+    inputs: ChosenInputs
     left_out: tuple[Finding, ...]
     """On excluded runs."""
     known: DatasetCard | None
@@ -176,7 +176,7 @@ def _read_job(state: State, store: Store, options: BuildDatasetOptions, place: P
 
 def _build(
     call: RunningCall, options: BuildDatasetOptions, place: Path | str, *, reported: Collection[str]
-) -> tuple[BuildResult, Inputs]:
+) -> tuple[BuildResult, ChosenInputs]:
     """Write the dataset, unless it is there; return the result and its inputs. ``reported`` are findings that are known."""
     if isinstance(place, Path):
         clear_beside(place)
@@ -278,7 +278,7 @@ def _find_foreign_files(place: Path | str, card: DatasetCard | None) -> tuple[st
 
 
 def _find_left_out(
-    inputs: Inputs, known: DatasetCard | None, options: BuildOptions, min_runs: int | None
+    inputs: ChosenInputs, known: DatasetCard | None, options: BuildOptions, min_runs: int | None
 ) -> tuple[Finding, ...]:
     """Return findings on excluded runs, as notes if ``min_runs`` are enough; `DatasetError` if there are too few."""
     chosen = inputs.chosen

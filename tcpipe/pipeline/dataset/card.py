@@ -28,7 +28,7 @@ from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.maps.map_facts import describe_layer
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
-from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.inputs import ChosenInputs
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.power.witnesses import compare_batteries
 from tcpipe.recipe import Recipe
@@ -81,7 +81,7 @@ REPEATABILITY_COLUMNS = (
 def make_dataset_card(
     samples: pa.Table,
     options: BuildOptions,
-    inputs: Inputs,
+    inputs: ChosenInputs,
     content: Content,
     *,
     repeatability: Mapping[str, Floor | None],
@@ -135,7 +135,7 @@ def make_dataset_card(
     return replace(card, findings=findings, verdict=judge_dataset(findings, card.runs, card.maps))
 
 
-def _label(recipe: Recipe, inputs: Inputs) -> LabelColumns:
+def _label(recipe: Recipe, inputs: ChosenInputs) -> LabelColumns:
     powers = (run.manifest.info.report.facts.power for run in inputs.runs)
     includes = tuple(sorted({load for power in powers if power is not None for load in power.includes}))
     velocity = recipe.label.velocity

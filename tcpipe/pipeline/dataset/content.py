@@ -48,7 +48,7 @@ from tcpipe.formats.parquet import (
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.zarr_arrays import Compression
-from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.inputs import ChosenInputs
 from tcpipe.pipeline.dataset.map_checks import find_contradictions, find_driven_obstacles, register_runs
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import list_needs, move_losses, pool_segments
@@ -186,7 +186,7 @@ class Content:
     findings: tuple[Finding, ...]
 
 
-def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) -> Content:
+def gather_content(directory: Path, inputs: ChosenInputs, options: BuildOptions, jobs: int) -> Content:
     """Sample, split and order; segments and pixels are kept in files in ``directory``, which must be empty.
 
     Raises `DatasetError`, `MapError`: no segment, none on the map, or none inside the region.
@@ -319,7 +319,7 @@ def _describe_nothing_sampled(segments: pa.Table, lost_m: Mapping[Loss, float], 
 
 
 def _describe_uncertainty(
-    segments: pa.Table, lost_m: Mapping[Loss, float], inputs: Inputs, recipe: Recipe
+    segments: pa.Table, lost_m: Mapping[Loss, float], inputs: ChosenInputs, recipe: Recipe
 ) -> list[str]:
     """Return the positions' uncertainty and findings of ingest, where uncertain positions are the main loss."""
     uncertain_m = lost_m.get(Loss.POSITION_UNCERTAIN, 0.0)

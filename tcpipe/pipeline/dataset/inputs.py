@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, MapError, StoreError, list_first
 from tcpipe.formats.dataset_card import (
-    Change,
     DatasetCard,
     DatasetInputs,
     ExclusionInputs,
+    RecordChange,
     RunInputs,
     RunSource,
     compare_records,
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Inputs:
+class ChosenInputs:
     """Runs, their entries of the card, the maps, the record of all inputs, and findings."""
 
     runs: tuple[StoredRun, ...]
@@ -74,7 +74,7 @@ class Inputs:
         return self.made_from.map_names
 
 
-def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
+def choose_inputs(store: Store, options: BuildOptions, state: State) -> ChosenInputs:
     """Return the runs of one robot ingested with this recipe, and the maps; `DatasetError` lists the candidates."""
     problems = list[str]()
     try:
@@ -96,7 +96,7 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> Inputs:
         remedy = Remedy("add_map", command="tcpipe add-map NAME --height FILE")
         findings += (make_finding("no-map", Subject("dataset", options.recipe.dataset.name), remedies=[remedy]),)
     sources = tuple(map(_make_source, once.runs))
-    return Inputs(once.runs, sources, records, maps, made_from, made_from.digest, once.again, chosen, findings)
+    return ChosenInputs(once.runs, sources, records, maps, made_from, made_from.digest, once.again, chosen, findings)
 
 
 def plan_inputs(store: Store, options: BuildOptions, state: State) -> DatasetInputs:
@@ -225,7 +225,7 @@ _OPTIONS = {
 """Options of a build, by the field of `DatasetInputs` that each rules."""
 
 
-def find_other_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -> list[str]:
+def find_other_options(card: DatasetCard, options: BuildOptions, inputs: ChosenInputs) -> list[str]:
     """Return a line with both values for each option of a build that differs from those of the dataset it would replace."""
     was, now = card.made_from, inputs.made_from
     if was.without_coordinates and now.without_coordinates:
@@ -240,7 +240,7 @@ def find_other_options(card: DatasetCard, options: BuildOptions, inputs: Inputs)
     return list(dict.fromkeys(lines))
 
 
-def _is_option(change: Change, options: BuildOptions) -> bool:
+def _is_option(change: RecordChange, options: BuildOptions) -> bool:
     """Return whether a change is of an option: a file may have other content, a store its first map, and the robot is that of the runs."""
     if change.path[0] in ("covariates", "exclusions", "kept_split"):
         is_own = change.path[0] == "kept_split" and options.keeps_own_split
@@ -250,7 +250,7 @@ def _is_option(change: Change, options: BuildOptions) -> bool:
     return change.path != ("recipe", "robot")
 
 
-def _format_option(change: Change, was: DatasetInputs, now: DatasetInputs) -> str:
+def _format_option(change: RecordChange, was: DatasetInputs, now: DatasetInputs) -> str:
     field = change.path[0]
     if field == "recipe":
         return f"recipe {change.name}: {format_value(change.was)} in the dataset, {format_value(change.now)} now"

@@ -36,7 +36,7 @@ _MARGIN_DEG = 0.05
 
 @dataclass(frozen=True, slots=True)
 class ExcludedSamples:
-    """What lists exclude: which of N samples, the lists for the card, each id with list, reason and outcome, and findings."""
+    """Samples that lists exclude: which of N samples, the lists for the card, each id with list, reason and outcome, and findings."""
 
     mask: NDArray[np.bool_]
     lists: tuple[Exclusion, ...]

@@ -1,4 +1,4 @@
-"""Datasets without coordinates: metres and seconds from origins that are stored nowhere, numbers for names, and a card of listed fields."""
+"""Datasets without coordinates: metres and seconds from origins that are not stored, numbers for names, and a card of listed fields."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tcpipe.formats.parquet import ROWS_PER_GROUP
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.pipeline.dataset.content import Content
-from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.inputs import ChosenInputs
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import LOCAL_PLACES
 from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
@@ -101,7 +101,7 @@ class Publication:
         bare = pa.schema([field.with_metadata({"unit": "", "doc": ""}) for field in added.schema])
         return replace(content, samples=replace(content.samples, added=added.cast(bare), convert=self.convert_samples))
 
-    def convert_inputs(self, inputs: Inputs) -> Inputs:
+    def convert_inputs(self, inputs: ChosenInputs) -> ChosenInputs:
         """Return inputs whose runs have public names, and nothing of their logs, tags and recipe."""
         runs = tuple(
             RunSource(
@@ -142,7 +142,7 @@ def _place(samples: pa.Table, end: str, datum_deg_m: tuple[float, float, float])
     return enu_from_geodetic(lon_deg, lat_deg, 0.0, datum_deg_m=datum_deg_m)[:, :2]
 
 
-def make_publication(content: Content, inputs: Inputs, *, patch_m: float) -> Publication:
+def make_publication(content: Content, inputs: ChosenInputs, *, patch_m: float) -> Publication:
     """Return the origins, by the samples of a dataset, and its public names."""
     if content.plane == LOCAL:
         raise DatasetError(

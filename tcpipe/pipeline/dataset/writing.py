@@ -36,7 +36,7 @@ from tcpipe.pipeline.dataset.card import (
     measure_repeatability,
 )
 from tcpipe.pipeline.dataset.content import SampleTable, gather_content, write_patches
-from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.inputs import ChosenInputs
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.without_coordinates import make_publication
 from tcpipe.report.dataset_report import SAMPLE_COLUMNS, render_dataset_report
@@ -45,7 +45,7 @@ from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_o
 logger = logging.getLogger("tcpipe")
 
 
-def write_dataset(directory: Path, inputs: Inputs, options: BuildOptions, jobs: int) -> DatasetCard:
+def write_dataset(directory: Path, inputs: ChosenInputs, options: BuildOptions, jobs: int) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
     waiting, recipe = directory / "spool", options.recipe
     waiting.mkdir()

@@ -28,7 +28,7 @@ from tcpipe.formats.documents import (
     scan,
 )
 from tcpipe.formats.place import Place
-from tcpipe.formats.runs import Call, Failure, Output, Tags
+from tcpipe.formats.runs import Call, LogFailure, Output, Tags
 
 
 @pytest.fixture(params=["directory", "bucket"])
@@ -169,7 +169,7 @@ def test_a_key_of_damaged_documents_alone_has_no_record_and_is_written_with_a_hi
 
 RECORDS = {
     "tags": [Tags("a", {"soil": soil}) for soil in ("dry", "wet")],
-    "failed": [Failure("c", ("/logs/b.bag",), ("cut",), version) for version in ("1", "2")],
+    "failed": [LogFailure("c", ("/logs/b.bag",), ("cut",), version) for version in ("1", "2")],
     "outputs": [Output(where="/out", exit_code=code) for code in (0, 1)],
     "calls": [Call(command="ingest", version="1", exit_code=code) for code in (None, 0)],
 }

@@ -16,7 +16,7 @@ from storage_server import FORBIDDEN, READ_ONLY, SKEWED, Fetched
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.integrity import Checksum
-from tcpipe.formats.place import Entry, Place, open_place
+from tcpipe.formats.place import FileEntry, Place, open_place
 
 NAMES = ("a.json", "drives of May/ü ñ #1?.json", "runs/100%/track.parquet", "runs/x/[1] & 'two'+~.bin")
 
@@ -29,7 +29,7 @@ def place(request, tmp_path, monkeypatch):
     return open_place(f"{url}/below this/")
 
 
-def _names(entries: list[Entry]) -> list[str]:
+def _names(entries: list[FileEntry]) -> list[str]:
     return [entry.name for entry in entries]
 
 

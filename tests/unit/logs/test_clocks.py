@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.clocks import Timeline, TopicTimes, settle_clocks
+from tcpipe.logs.clocks import TopicTimeline, TopicTimes, settle_clocks
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
@@ -23,7 +23,7 @@ def settle(**topics: TopicTimes):
     return found.timelines, found.steps
 
 
-def one(topic: TopicTimes) -> tuple[Timeline, int]:
+def one(topic: TopicTimes) -> tuple[TopicTimeline, int]:
     found, steps = settle(topic=topic)
     return found["topic"], len(steps)
 

@@ -14,7 +14,7 @@ from tcpipe.power.noise import (
     estimate_resolution,
     fit_signal_model,
 )
-from tcpipe.power.rails import Rail, Samples, integrate_energy, make_rail, make_samples
+from tcpipe.power.rails import Rail, SampledSignal, integrate_energy, make_rail, make_samples
 
 ZERO = stamps(1)[0]
 STARTS = ZERO + (np.arange(5, 595, 1.3) * 1e9).astype(np.int64)
@@ -192,15 +192,15 @@ def test_noise_does_not_hang_on_when_the_clock_began():
 
 
 def test_a_resolution_shows_where_more_than_half_of_the_values_repeat():
-    assert estimate_resolution(Samples(np.arange(4), np.array([0.0, 0.5, 0.0, 0.5]))) == 0.0
-    assert estimate_resolution(Samples(np.arange(5), np.array([0.0, 0.5, 0.0, 0.5, 0.0]))) == 0.5
-    assert estimate_resolution(Samples(np.arange(5), np.zeros(5))) == 0.0
+    assert estimate_resolution(SampledSignal(np.arange(4), np.array([0.0, 0.5, 0.0, 0.5]))) == 0.0
+    assert estimate_resolution(SampledSignal(np.arange(5), np.array([0.0, 0.5, 0.0, 0.5, 0.0]))) == 0.5
+    assert estimate_resolution(SampledSignal(np.arange(5), np.zeros(5))) == 0.0
 
 
 def test_nothing_is_said_of_two_samples_and_of_a_rail_without_any():
     second = ZERO + np.array([0]), ZERO + np.array([1_000_000_000]), NEVER_STILL
     assert estimate_energy_noise([record(np.arange(2.0), np.arange(2.0))], *second).std_joule().tolist() == [0.0]
-    empty = Samples(np.empty(0, np.int64), np.empty(0))
+    empty = SampledSignal(np.empty(0, np.int64), np.empty(0))
     gone = Rail("drive", empty, empty, False, empty.stamp_ns, empty.value, empty.value)
     assert estimate_energy_noise([gone], *second).std_joule().tolist() == [0.0]
 
@@ -224,11 +224,13 @@ ZIGZAG = np.arange(100) % 2.0
 
 
 def signal(value, period_s=0.05):
-    return Samples(1_000_000_000 + np.round(np.arange(len(value)) * period_s * 1e9).astype(np.int64), np.array(value))
+    return SampledSignal(
+        1_000_000_000 + np.round(np.arange(len(value)) * period_s * 1e9).astype(np.int64), np.array(value)
+    )
 
 
 def test_curvature_is_the_distance_from_the_line_through_the_neighbours():
-    uneven = Samples(np.array([0, 1, 3]) * 1_000_000_000, np.array([0.0, 1.0, 0.0]))
+    uneven = SampledSignal(np.array([0, 1, 3]) * 1_000_000_000, np.array([0.0, 1.0, 0.0]))
     assert compute_curvature(uneven) == pytest.approx([1 / (1 + 1 / 9 + 4 / 9)])
     assert compute_curvature(signal(ZIGZAG)) == pytest.approx(np.full(98, 1 / 1.5))
 

@@ -15,7 +15,7 @@ from tcpipe.formats import documents
 from tcpipe.formats.documents import make_key
 from tcpipe.formats.place import open_place
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.runs import Call, Failure, StoredMap
+from tcpipe.formats.runs import Call, LogFailure, StoredMap
 from tcpipe.pipeline import report as report_module
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.problems import acknowledge
@@ -52,8 +52,8 @@ def store(tmp_path_factory):
     supersede(store, "d", "a")
     build_dataset(here / "dataset", store=store.root)
     add(store, "c", 3, distance_by_reason_m={"kept": 20.0, "gap": 60.0, "stationary": 5.0})
-    put_failure(store, Failure("1" * 64, ("/logs/junk",), (f"/logs/junk: {EVIL} is no log",), "0"))
-    put_failure(store, Failure("a", ("/logs/a.mcap",), ("/logs/a.mcap: was cut",), "0"))
+    put_failure(store, LogFailure("1" * 64, ("/logs/junk",), (f"/logs/junk: {EVIL} is no log",), "0"))
+    put_failure(store, LogFailure("a", ("/logs/a.mcap",), ("/logs/a.mcap: was cut",), "0"))
     failed = {"/logs/passing.mcap": "No space left on device", "/logs/b.mcap": "No space left on device"}
     call = Call(command="ingest", version="0", exit_code=3, counts={"failed": 1}, failed=failed)
     store.put(store.scan(), "calls", "f" * 16, call)
@@ -148,7 +148,7 @@ def test_names_are_text_and_pages_are_led_to_where_they_are(store):
 
 def test_a_store_of_failed_logs_alone_has_a_page(tmp_path):
     store = open_store(tmp_path / "store", create=True)
-    put_failure(store, Failure("1" * 64, ("/logs/junk",), ("/logs/junk: is no log",), "0"))
+    put_failure(store, LogFailure("1" * 64, ("/logs/junk",), ("/logs/junk: is no log",), "0"))
     _, html, *_ = shown(store)
     assert "The store has no usable runs." in html
     assert "junk: is no log" in html

@@ -4,7 +4,7 @@ from scipy.spatial import cKDTree
 from splits_squares import squares
 
 from tcpipe.splits.audit import (
-    Ground,
+    Footprints,
     audit_leakage,
     compute_nearest_m,
     compute_shared_fraction,
@@ -22,7 +22,7 @@ def audit(split, centres, run=None, start=None, **keywords):
 
 
 def ground(corners):
-    return Ground(corners, np.arange(len(corners)))
+    return Footprints(corners, np.arange(len(corners)))
 
 
 def test_nothing_trains():
@@ -64,7 +64,7 @@ def test_the_nearest_square_is_found_though_many_centres_are_nearer(count):
 def test_each_footprint_is_held_against_its_nearest_however_many_there_are():
     ours, theirs = squares([(0, 0), (50, 0)]), squares([(3 + i, 0) for i in range(40)])
     assert compute_nearest_m(ours, ground(theirs)) == pytest.approx([2.0, 7.0])
-    assert compute_nearest_m(ours, Ground(theirs, np.arange(10, 40))) == pytest.approx([12.0, 7.0])
+    assert compute_nearest_m(ours, Footprints(theirs, np.arange(10, 40))) == pytest.approx([12.0, 7.0])
     assert compute_nearest_m(ours, ground(theirs[:0])).size == 0
     assert compute_nearest_m(ours[:0], ground(theirs)).size == 0
 

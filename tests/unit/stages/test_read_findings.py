@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.clocks import AlignedClocks, SimulatedClock, Timeline
+from tcpipe.logs.clocks import AlignedClocks, SimulatedClock, TopicTimeline
 from tcpipe.logs.messages import Readings
 from tcpipe.logs.roles import PlayedRole, RoleAssignment
 from tcpipe.power.readings import PowerReadings
@@ -20,7 +20,7 @@ SENSOR = Sensor("/fix", "sensor_msgs/msg/NavSatFix", "gps", "the only one", plac
 def timeline(**said):
     stamp_ns = np.arange(COUNT, dtype=np.int64) * 100_000_000
     told = {"row": np.arange(COUNT), "stamp_ns": stamp_ns, "clock_epoch": np.zeros(COUNT, np.int16), "source": "header"}
-    return Timeline(**{**told, "why": "header-follows-log-time", "offset_s": 0.5, **said})
+    return TopicTimeline(**{**told, "why": "header-follows-log-time", "offset_s": 0.5, **said})
 
 
 def source(*, role="gnss", header=True, **said):
