@@ -172,10 +172,6 @@ class Call:
     """CPU time of the process and its workers, including workers on a cluster [s]."""
     failed: Mapping[str, str] = field(default_factory=dict)
     """By log, why it failed for a reason that may pass."""
-    done_bytes: int = 0
-    """Size of the logs that came in [byte]."""
-    written_bytes: int = 0
-    """Size of the runs that were written, or of the dataset [byte]."""
 
     @property
     def end(self) -> str:

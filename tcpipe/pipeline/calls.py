@@ -20,7 +20,7 @@ from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.execution import read_cluster_cpu_s
 from tcpipe.formats.documents import State, parse_name
 from tcpipe.formats.json_files import to_plain
-from tcpipe.formats.runs import Call, Problem, Process, RunFacts
+from tcpipe.formats.runs import Call, Problem, Process
 from tcpipe.store import Store, is_store
 from tcpipe.tables.findings import Remedy, Subject, make_finding
 
@@ -230,59 +230,6 @@ def list_ended_calls(state: State) -> list[Call]:
 INGEST, BUILD, ADD_MAP, PRUNE, ACKNOWLEDGE = "ingest", "build-dataset", "add-map", "prune", "acknowledge"
 
 
-@dataclass(frozen=True, slots=True)
-class Rates:
-    """Cost of work: CPU seconds and bytes written per byte of log or per sample, and CPU seconds per call."""
-
-    cpu_s: float
-    written_bytes: float
-    call_s: float
-
-
-MEASURED = {INGEST: Rates(0.2e-6, 1.1, 0.7), BUILD: Rates(180e-6, 4_300.0, 1.5)}
-"""Rates measured on one core of 2025, for drives without a camera and patches of 40 px and three layers (docs/internals/performance.md)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """Expected work, time and bytes."""
-
-    of: str
-    amount: int
-    """Bytes of log, or samples."""
-    wall_s: float
-    written_bytes: int
-    source: str
-    """Source of the figures."""
-
-    def __str__(self) -> str:
-        """Return it as one line."""
-        amount = format_bytes(self.amount) if self.of == "logs" else f"{self.amount} {self.of}"
-        return f"{amount}: about {format_duration(self.wall_s)} and {format_bytes(self.written_bytes)} ({self.source})"
-
-
-def estimate(calls: Sequence[Call], command: str, amount: int, *, jobs: int) -> Estimate:
-    """Return the estimate for some work, from earlier calls of the same command and from default figures.
-
-    The default figures count as one more call, with as much work as takes the time of an empty call: few samples do not predict a million.
-    """
-    like = [call for call in calls if call.command == command and _parse_amount(call)]
-    unit = "logs" if command == INGEST else "samples"
-    rates, source = MEASURED[command], "from default figures: this store has no earlier calls"
-    if like:
-        done, alone = sum(_parse_amount(call) for call in like), rates.call_s / rates.cpu_s
-        more_s = sum(max(0.0, call.cpu_s - rates.call_s) for call in like)
-        written = sum(call.written_bytes for call in like) + rates.written_bytes * alone
-        rates = Rates((more_s + rates.call_s) / (done + alone), written / (done + alone), rates.call_s)
-        source = f"by {len(like)} earlier call{'s' * (len(like) > 1)}"
-    return Estimate(unit, amount, rates.call_s + rates.cpu_s * amount / jobs, int(rates.written_bytes * amount), source)
-
-
-def count_bytes(rows: Iterable[RunFacts]) -> int:
-    """Return the size of the tables and streams of runs [byte]."""
-    return sum(checksum.size_bytes for row in rows for checksum in (*row.tables.values(), *row.streams.values()))
-
-
 def format_duration(seconds: float) -> str:
     """Return a duration in words."""
     for unit, size in (("h", 3600.0), ("min", 60.0)):
@@ -297,10 +244,6 @@ def format_bytes(count: float) -> str:
         if count >= size:
             return f"{count / size:.3g} {unit}"
     return f"{count:.0f} B"
-
-
-def _parse_amount(call: Call) -> int:
-    return call.done_bytes if call.command == INGEST else call.counts.get("samples", 0)
 
 
 def _read_cpu_s() -> float:

@@ -20,7 +20,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_presigned, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
 from tcpipe.formats.runs import LogFailure, find_lineage, find_problems, make_failure
-from tcpipe.pipeline.calls import INGEST, RunningCall, count_bytes, estimate, record_call
+from tcpipe.pipeline.calls import INGEST, RunningCall, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
@@ -179,22 +179,18 @@ def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path, *, is_
         tell(_iterate_results(call, steps, jobs=options.jobs, cluster=options.cluster))
     summary = IngestSummary(store.root, tuple(results[index] for index in sorted(results)))
     call.is_whole = shard is None
-    call.result = _describe_call(summary, tasks)
+    call.result = _describe_call(summary)
     _warn_of_unmatched_windows(ruling.mask.windows, call.state)
     return summary
 
 
 def _announce_new_results(steps: Sequence[PlannedLog], state: State) -> None:
-    """Say how many runs are made again because this version of tcpipe gives other results, and what that takes."""
+    """Log how many runs are made again because this version of tcpipe gives other results."""
     contents = {row.log.sha256 for row in state.runs.values() if row.results_version != RESULTS_VERSION}
     again = [step for step in steps if step.state == "outdated" and step.task.source.sha256 in contents]
     if again:
-        calls = [call for _, call in state.calls]
-        work = estimate(calls, INGEST, sum(step.task.source.size_bytes for step in again), jobs=1)
-        logger.warning(
-            "tcpipe %s gives other results (version %d): %d runs are made again: %s",
-            __version__, RESULTS_VERSION, len(again), work,
-        )  # fmt: skip
+        text = "tcpipe %s gives other results (version %d): %d runs are made again"
+        logger.warning(text, __version__, RESULTS_VERSION, len(again))
 
 
 _MOST_RUNS = 5  # named in one message
@@ -211,10 +207,8 @@ def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> N
             logger.warning(text, pattern, list_first(run_ids, _MOST_RUNS))
 
 
-def _describe_call(summary: IngestSummary, tasks: Iterable[IngestTask]) -> dict[str, Json]:
+def _describe_call(summary: IngestSummary) -> dict[str, Json]:
     """Return what the record of a call holds of its work."""
-    done = [result for result in summary.results if result.status in ("done", "damaged", "empty")]
-    sizes = {task.source.name: task.source.size_bytes for task in tasks}
     failed = [result for result in summary.results if result.status == "failed" and not result.known]
     return {
         "exit_code": summary.exit_code,
@@ -223,8 +217,6 @@ def _describe_call(summary: IngestSummary, tasks: Iterable[IngestTask]) -> dict[
         "failed": {
             result.log: result.problems[0] for result in summary.results if result.transient and result.problems
         },
-        "done_bytes": sum(sizes.get(result.log, 0) for result in done),
-        "written_bytes": count_bytes(result.run for result in done if result.run),
     }
 
 

@@ -22,9 +22,7 @@ from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Call, Problem
 from tcpipe.pipeline.calls import (
     INGEST,
-    Estimate,
     OpenCall,
-    estimate,
     format_duration,
     is_below,
     list_ended_calls,
@@ -83,8 +81,6 @@ class Status:
     """Logs by state."""
     groups: tuple[Group, ...]
     """By state and cause."""
-    to_do: Estimate | None
-    """Estimate for the next ingest; None if nothing is to do."""
     problems: tuple[Finding, ...]
     """Sources that cannot be read, runs that are not complete, logs that wait for too long, calls that were killed, damaged documents,
     outputs that are out of date or whose last call failed."""
@@ -106,7 +102,6 @@ class Status:
         """Return the lines as one text."""
         said = ", ".join(f"{count} {_format_words(state)}" for state, count in self.counts.items()) or "no logs"
         lines = [self.to_do_now, f"{self.store}: {said}", *(str(group) for group in self.groups)]
-        lines += [f"to do: {self.to_do}"] if self.to_do else []
         lines += [f"of earlier calls: {line}" for line in self.gone]
         lines += [f"{self.superseded_runs} superseded runs"] if self.superseded_runs else []
         lines += [f"{call.state}: {call}" for call in self.open_calls if call.state != "killed"]
@@ -145,24 +140,21 @@ def find_status(options: IngestOptions, *, create: bool = False) -> Status:
     problems += [make_missing(path, state) for path in missing if path in lately]
     problems += [] if create else find_stale_outputs(opened, state)
     problems = [problem for problem in problems if problem.key not in acknowledged]
-    groups, waiting = tuple(_iterate_groups(steps)), [step for step in steps if step.is_todo]
+    groups = tuple(_iterate_groups(steps))
     current = [run.facts for run in opened.runs(state) if run.facts.ingest_key == ingest_key(ruling)]
     worse = ((run.run_id, [each for each in run.findings if each.severity != "note"]) for run in current)
     by_code = group_findings(worse)
-    calls = list_ended_calls(state)
-    size_bytes = sum(step.task.source.size_bytes for step in waiting)
     return Status(
         store=str(opened.root),
         to_do_now=_describe_first(problems, groups),
         sources=tuple(format_path(log) for log in given),
         counts=dict(sum((Counter({group.state: len(group.logs)}) for group in groups), Counter())),
         groups=groups,
-        to_do=estimate(calls, INGEST, size_bytes, jobs=options.jobs) if waiting else None,
         problems=tuple(problem.finding for problem in problems),
         gone=tuple(chain(*(lines for path, lines in missing.items() if path not in lately))),
         superseded_runs=sum(bool(row.superseded_by) for row in state.runs.values()),
         open_calls=tuple(call for call in open_calls if call.problem.key not in acknowledged),
-        history=tuple(calls[:_LATEST_CALLS]),
+        history=tuple(list_ended_calls(state)[:_LATEST_CALLS]),
         runs=len(current),
         findings={group.code: len(group.of) for group in by_code},
         exit_code=3 if problems or any(group.state in TROUBLE for group in groups) else 0,

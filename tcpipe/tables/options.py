@@ -66,7 +66,7 @@ SPEED = Option(
     "MPS",
 )
 PREDICTOR = Option("Run your own model: FILE.py[:NAME] or entry point.", metavar="CODE")
-DRY_RUN = Option("Say what would be done, and what it would take; do nothing.")
+DRY_RUN = Option("Print what would be done; change nothing.")
 SEED = Range(0, 2**32 - 1)
 """Seeds of all random number generators."""
 

@@ -29,7 +29,7 @@ from tcpipe.formats.parquet import return_freed_memory
 from tcpipe.formats.published_outputs import check_kind, fetch_directory_by_range, find_newest, write_output
 from tcpipe.formats.runs import Options, Output
 from tcpipe.motion.distance_breakdown import KEPT
-from tcpipe.pipeline.calls import BUILD, Estimate, RunningCall, describe_error, estimate, list_ended_calls, record_call
+from tcpipe.pipeline.calls import BUILD, RunningCall, describe_error, record_call
 from tcpipe.pipeline.dataset.inputs import ChosenInputs, choose_inputs, find_other_options, plan_inputs, prove_maps
 from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
@@ -58,8 +58,8 @@ class BuildResult:
     """3 if a finding is a problem."""
     recipe: str = ""
     """The recipe's source, as a command found it."""
-    estimate: Estimate | None = None
-    """Estimate of a dry run, as if each segment became a sample."""
+    segments: int | None = None
+    """Number of segments of a dry run: at most so many samples."""
     foreign_files: tuple[str, ...] = ()
     """Files in its directory that tcpipe did not write, and keeps."""
 
@@ -82,7 +82,7 @@ class BuildResult:
     def _facts(self) -> list[str]:
         card = self.card
         if card is None:
-            return [f"{self.path}: would have at most {self.estimate}"]
+            return [f"{self.path}: would have at most {self.segments} samples"]
         counts = ", ".join(f"{card.splits[name]} {name}" for name in SPLITS)
         head = f"{self.path}: {card.samples} samples ({counts})"
         if self.status == "unchanged":
@@ -141,9 +141,8 @@ def _plan(state: State, store: Store, options: BuildDatasetOptions, place: Path 
     if job.is_made and job.known is not None:
         return _make_result(place, "unchanged", job.known, job.left_out, ())
     most = sum(run.facts.segments - int(job.inputs.again[run.run_id].sum()) for run in job.inputs.runs)
-    expected = estimate(list_ended_calls(state), BUILD, most, jobs=options.jobs)
     code = 3 if select_problems(job.inputs.findings) else 0
-    return BuildResult(str(place), "planned", job.inputs.findings, exit_code=code, estimate=expected)
+    return BuildResult(str(place), "planned", job.inputs.findings, exit_code=code, segments=most)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +200,6 @@ def _build(
     call.result |= {
         "exit_code": result.exit_code,
         "counts": {"runs": len(job.inputs.runs), "samples": card.samples},
-        "written_bytes": sum(checksum.size_bytes for checksum in card.checksums.values()),
     }
     return result, job.inputs
 

@@ -12,8 +12,7 @@ from wheel_drives import START_NS, ask_status, drive_at
 from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.errors import UsageError
-from tcpipe.formats.runs import Call, Output
-from tcpipe.pipeline import calls
+from tcpipe.formats.runs import Output
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import ingest_run as ingest_run_module
 from tcpipe.pipeline import plan as plan_module
@@ -64,14 +63,10 @@ def test_what_ingest_did_is_what_status_says_and_the_calls_are_remembered(first_
         "partial": ["cut.mcap"],
         "failed_permanent": ["junk.bag"],
     }
-    assert (found.exit_code, found.to_do, found.problems) == (3, None, ())
+    assert (found.exit_code, found.problems) == (3, ())
     (call,) = found.history
     assert (call.command, call.counts, call.exit_code) == ("ingest", {"done": 2, "damaged": 1, "failed": 1}, 3)
     assert call.works_on == (str(first_night / "logs"),)
-    sizes = [(first_night / "logs" / f"{name}.mcap").stat().st_size for name in ("whole", "second", "cut")]
-    assert call.done_bytes == sum(sizes)
-    kept = [path for path in (first_night / "store" / "blobs").rglob("*") if path.is_file()]
-    assert call.written_bytes == sum(path.stat().st_size for path in kept)
     assert call.wall_s > 0.0
     assert call.cpu_s > 0.0
     assert call.end > call.begin
@@ -162,8 +157,6 @@ def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
     assert told["failed_transient", "No space left on device (28)"] == (str(logs / "passing.mcap"),)
     assert told["done", "damaged, acknowledged"] == (str(logs / "cut.mcap"),)
     assert found.exit_code == 3  # the disk is full
-    assert found.to_do.amount == sum((logs / f"{name}.mcap").stat().st_size for name in ("new", "passing", "whole"))
-    assert found.to_do.source == "by 1 earlier call"
     assert "2 pending" in str(found)
 
 
@@ -259,26 +252,7 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_pat
     )
     assert told.exit_code == 0, told.output
     assert "4 pending" in told.output
-    assert "from default figures: this store has no earlier calls" in told.output
     assert not (tmp_path / "none").exists()
-
-
-def test_an_estimate_is_what_the_like_took():
-    night = Call(command="ingest", version="0", cpu_s=2_000.7, done_bytes=10**9, written_bytes=5 * 10**8)
-    other = replace(night, cpu_s=1_000.7, done_bytes=5 * 10**8, written_bytes=10**8)
-    quiet, build = replace(night, done_bytes=0, cpu_s=9.0), replace(night, command="build-dataset")
-    found = calls.estimate([night, other, quiet, build], "ingest", 10**9, jobs=4)
-    assert found.wall_s == pytest.approx(0.7 + 500.0, rel=0.01)
-    assert found.written_bytes == pytest.approx(4e8, rel=0.01)
-    assert str(found) == f"1 GB: about 8 min and {found.written_bytes / 1e6:.3g} MB (by 2 earlier calls)"
-
-
-def test_a_small_call_tells_little_of_a_million_samples():
-    small = Call(command="build-dataset", version="0", counts={"samples": 312}, cpu_s=2.3, written_bytes=2_900_000)
-    found = calls.estimate([small], "build-dataset", 1_000_000, jobs=1)
-    assert 100.0 < found.wall_s < 300.0, "185 s (docs/internals/performance.md); 7,400 s in proportion"
-    assert found.written_bytes < 5e9
-    assert calls.estimate([small], "build-dataset", 312, jobs=8).wall_s == pytest.approx(1.5, abs=0.1)
 
 
 def test_a_drive_without_a_segment_is_news_once_and_can_be_accepted(tmp_path):
@@ -320,7 +294,7 @@ def raise_version(monkeypatch):
         monkeypatch.setattr(module, "RESULTS_VERSION", 7)
 
 
-def test_a_version_with_other_results_makes_all_runs_again_and_says_how_many_and_how_long(night, monkeypatch, caplog):
+def test_a_version_with_other_results_makes_all_runs_again_and_says_how_many(night, monkeypatch, caplog):
     logs, store = night / "logs", night / "store"
     ingest([logs], store=store, recipe=Recipe())
     raise_version(monkeypatch)
@@ -332,8 +306,7 @@ def test_a_version_with_other_results_makes_all_runs_again_and_says_how_many_and
     caplog.clear()
     summary = ingest([logs], store=store, recipe=Recipe())
     (line,) = [line for line in caplog.messages if "gives other results" in line]
-    assert f"tcpipe {__version__} gives other results (version 7): 3 runs are made again: " in line
-    assert ": about " in line
+    assert f"tcpipe {__version__} gives other results (version 7): 3 runs are made again" in line
     assert sorted(result.status for result in summary.results) == ["damaged", "done", "done", "failed"]
     assert {run.facts.results_version for run in Store(store).runs()} == {7}
     caplog.clear()
