@@ -24,6 +24,7 @@ from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles
 from tcpipe.planning.path_cost import PATH_SEGMENTS
+from tcpipe.robots import PowerSource, Robot
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.findings import Entry, read_catalogue
 from tcpipe.tables.levels import (
@@ -331,37 +332,44 @@ Names end in the unit; numbers without a range: {_USUAL_RANGE}. Reasons: [decisi
 
 def _robots() -> str:
     known = load_shipped_profiles()
-    robots = "| robot | message types | words of topic names | platform | width | length | maximum speed | voltage |\n"
-    robots += "|---|---|---|---|---|---|---|---|\n"
-    for name, of in sorted(known.robots.items()):
-        volts = "" if of.voltage_range_volt is None else "{:g} V to {:g} V".format(*of.voltage_range_volt)
-        measures = ((of.width_m, "m"), (of.length_m, "m"), (of.max_velocity_mps, "m/s"))
-        cells = [f"{value:g} {unit}" if value is not None else "" for value, unit in measures]
-        found_by = (", ".join(of.status_types), ", ".join(of.topic_words), of.platform or "")
-        robots += f"| {' | '.join((f'`{name}`', *found_by, *cells, volts))} |\n"
-    power = "| message type | for | voltage | current | averaged | drawn current | not known |\n|---|---|---|---|---|---|---|\n"
+    robots = "".join(_describe_robot(name, robot) for name, robot in sorted(known.robots.items()) if robot != Robot())
+    power = "".join(_describe_source(source) for source in known.power_sources if not source.unsupported_reason)
     refused = "".join(f"- `{name}` {why}.\n" for name, why in known.refusals().items())
-    for source in known.power_sources:
-        if source.unsupported_reason:
-            continue
-        only = (source.platform, source.topic and f"…{source.topic}", source.husky_power and f"`{source.husky_power}`")
-        only += ("in place of those above" if source.fallback else None,)
-        counter = f"counter {source.energy} times {source.energy_scale:g} J" if source.energy else ""
-        drawn = source.sign.removeprefix("drawn_")
-        loads = source.other_loads.partition(" (")[0]
-        fields = f"{source.voltage} | {counter or source.current}{', with ' + loads if loads else ''}"
-        averaged = "found from motion" if source.averaging_unknown else "yes" if source.averaged else "no"
-        cells = (f"`{source.type}`", ", ".join(filter(None, only)), fields, averaged, drawn, source.open_questions)
-        power += f"| {' | '.join(cells)} |\n"
     return (
         f"{_NOTE}\n# Robots and power messages\n\nBuilt-in profiles, from the TOML files in `tcpipe/robots/`, where each number has "
         "its source. A recipe can have the same tables ([your robot](../how-to/your-robot.md)).\n\n## Robots\n\nMessage types "
-        "or words of topic names identify a robot; empty cells are not known. A log with "
-        "`clearpath_platform_msgs/Power` and no other platform's name is a Husky's, the first to publish it.\n\n"
-        f"{robots}\n## Power messages\n\nBest first; a row is a rail. Bare numbers "
-        f"(`std_msgs/Float32`, `Float64`) are identified by their topic's name. *auto*: the mean over the run decides.\n\n{power}\n"
+        "or words of topic names identify a robot; the rest is `generic`. A log with `clearpath_platform_msgs/Power` and no other "
+        f"platform's name is a Husky's, the first to publish it.\n\n{robots}\n## Power messages\n\nBest first, each with voltage "
+        "and current of a rail. Bare numbers (`std_msgs/Float32`, `Float64`) are identified by their topic's name. Sampled values and "
+        f"positive drawn currents are not named; *auto*: the mean over the run decides the sign.\n\n{power}\n"
         f"Types whose currents are not, or may not be, drawn from a battery; tcpipe does not use them:\n\n{refused}"
     )
+
+
+def _describe_robot(name: str, robot: Robot) -> str:
+    size = f"{robot.width_m:g} m × {robot.length_m:g} m" if robot.width_m and robot.length_m else ""
+    speed = f"{robot.max_velocity_mps:g} m/s" if robot.max_velocity_mps else ""
+    volts = "{:g} V to {:g} V".format(*robot.voltage_range_volt) if robot.voltage_range_volt else ""
+    types = ", ".join(f"`{kind}`" for kind in robot.status_types)
+    facts = (types, f"words {', '.join(robot.topic_words)}", f"platform {robot.platform}", size, speed, volts)
+    return f"- `{name}`: {'; '.join(filter(None, facts))}\n"
+
+
+def _describe_source(source: PowerSource) -> str:
+    only = (source.platform, source.topic and f"…{source.topic}", source.husky_power and f"`{source.husky_power}`")
+    only += ("in place of those above" if source.fallback else None,)
+    where = f" ({', '.join(filter(None, only))})" if any(only) else ""
+    counter = f"counter {source.energy} times {source.energy_scale:g} J" if source.energy else ""
+    loads = source.other_loads.partition(" (")[0]
+    averaged = "averaging found from motion" if source.averaging_unknown else "averaged" if source.averaged else ""
+    sign = source.sign.removeprefix("drawn_")
+    facts = (
+        ", ".join(filter(None, (source.voltage, counter or source.current))) + (f", with {loads}" if loads else ""),
+        averaged,
+        f"sign {sign}" if sign != "positive" else "",
+        f"not known: {source.open_questions}" if source.open_questions else "",
+    )
+    return f"- `{source.type}`{where}: {'; '.join(filter(None, facts))}\n"
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ _PARTS = 5
 
 
 def choose_kind(data: Dataset, config: FitConfig, split: Split | None = None) -> ModelKind:
-    """Return the simplest kind that predicts other runs as well as the best one, within a standard error of the difference (ADR-23).
+    """Return the simplest kind that predicts other runs as well as the best one, within a standard error of the difference.
 
     Each part of the runs is predicted by models of the others; of a single run, each fold. The loss is the squared error of time and of
     energy, each over its variance. ``split`` are labelled samples of train, by default all.

@@ -1,4 +1,4 @@
-"""docs/how-to/change-tcpipe.md: each row's places exist, and a small change there, in a copy of the package, has the stated effect."""
+"""The table "Where do I change" of ARCHITECTURE.md: each place exists, and a small change there, in a copy of the package, has its effect."""
 
 import ast
 import json
@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 ROWS = [
     [cell.strip() for cell in line.strip("|").split(" | ")]
-    for line in (ROOT / "docs/how-to/change-tcpipe.md").read_text(encoding="utf-8").splitlines()
+    for line in (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").splitlines()
     if re.match(r"\| .*\*\*", line)
 ]
 PLACES = {
@@ -179,12 +179,3 @@ def test_tests_of_the_rows_exist() -> None:
     named = [path for row in ROWS for path in re.findall(r"`(tests/[\w/.]+)`", row[3])]
     assert len(named) >= len(ROWS)
     assert not [path for path in named if not (ROOT / path).exists()]
-
-
-def test_architecture_names_the_same_places() -> None:
-    page = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
-    section = page.split("## Where do I change", 1)[1].split("\n## ", 1)[0]
-    places = set(re.findall(r"`([\w/.]+\.\w+)(?:: [\w, ]+)?`", section))
-    known = {file.removeprefix("tcpipe/") for row in PLACES.values() for file, _ in row}
-    assert len(places) >= 10
-    assert places <= known

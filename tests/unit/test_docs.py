@@ -58,7 +58,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_the_pages_stay_short() -> None:
     pages = list((ROOT / "docs").rglob("*.md"))
     assert len(pages) <= 65
-    assert sum(len(page.read_text(encoding="utf-8").split()) for page in pages) <= 62_500
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in pages) <= 51_800
     assert len((ROOT / "docs/how-to/run-unattended.md").read_text(encoding="utf-8").split()) <= 1_800
     below_first_screen = (ROOT / "README.md").read_text(encoding="utf-8").split("\n## ", 1)[1]
     assert len(below_first_screen.split()) <= 600
@@ -94,7 +94,7 @@ def test_every_decision_stands_once_in_the_index() -> None:
 def test_references_to_decisions_lead_somewhere() -> None:
     """Code and pages name a decision as ADR-n: its number exists, is the one that a link beside it leads to, and no older form is left."""
     numbers = {int(page.name[:4]) for page in (ROOT / "docs/adr").glob("[0-9]*.md")}
-    assert len(numbers) <= 15
+    assert len(numbers) <= 12
     parts = [ROOT / "tcpipe", ROOT / "tests", ROOT / "docs", ROOT / "schemas", ROOT / "benchmarks", ROOT / "pipelines"]
     files = [path for part in parts for path in part.rglob("*") if path.suffix in (".py", ".md", ".toml", ".json")]
     named, wrong = 0, []
