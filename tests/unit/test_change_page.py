@@ -1,4 +1,4 @@
-"""The table "Where do I change" of ARCHITECTURE.md: each place exists, and a small change there, in a copy of the package, has its effect."""
+"""Table "Where do I change" of ARCHITECTURE.md: each place exists, and a small change there, in a copy of the package, has its effect."""
 
 import ast
 import json
