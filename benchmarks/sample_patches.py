@@ -54,7 +54,6 @@ class MemoryMap:
     height_reference_m: float = 600.0
     name: str = "memory"
     factors: tuple[int, ...] = (1,)
-    banded: dict[str, Any] = field(default_factory=dict)
 
     def expect(self, tiles):
         """Hold all tiles already."""

@@ -73,7 +73,6 @@ SMALLEST = {
     "load_dataset": Smallest("{out} 300", rf"epoch from disk, zstd: {NUMBER} x memmap"),
     "map_shift": Smallest("--sites 1", r"alone[\s\S]*shared"),
     "many_runs": Smallest("{out} 3", rf"build-dataset, cold +{NUMBER} s wall"),
-    "own_layers": Smallest("{out} --drives 4", rf"noise +: E +{NUMBER} J, T {NUMBER} s on"),
     "path_coverage": Smallest("--train 2 --metres 60 --further 1 --models 1", rf"energy +1 m: +{NUMBER} %"),
     "peers": Smallest(
         "--seeds 1 --length 40 --outage 10 --only white", rf"white +pyins( +{NUMBER}){{3}}", package="pyins"

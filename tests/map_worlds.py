@@ -142,8 +142,6 @@ class ArrayMap:
     factors: tuple = (1,)
     more: dict = field(default_factory=dict)
     """Layers that are not the paper's."""
-    banded: dict = field(default_factory=dict)
-    """Those of several bands."""
 
     @property
     def layers(self):

@@ -66,7 +66,7 @@ _BYTES = np.arange(256, dtype=np.uint8)
 
 @dataclass(frozen=True)
 class TensorLayout:
-    """Channels in their order: names of layers, those of several bands with as many channels, or of a categorical one with `ONE_HOT`.
+    """Channels in their order: names of layers, or of a categorical one with `ONE_HOT`.
 
     ``known`` are all layers.
     """
@@ -103,7 +103,7 @@ class TensorLayout:
 
     def _count_planes(self, channel: str) -> int:
         layer = self.known[self._name_layer(channel)]
-        return max(len(layer.bands), 1) if layer.name == channel else round(layer.high)
+        return 1 if layer.name == channel else round(layer.high)
 
     def form(self, pixels: Pixels, rows: NDArray[np.int64], mirrored: NDArray[np.bool_] | None = None) -> Floats:
         """Return the tensor of ``rows``, shape (B,), of stored layers: float32, shape (B, px, px, depth).
@@ -120,10 +120,6 @@ class TensorLayout:
                 for place in range(self._count_planes(channel)):
                     is_it = np.equal(_BYTES, place + 1).astype(np.float32)
                     form_bytes(pixels[layer.name], rows, flips, is_it, at + place, out)
-            elif layer.bands:
-                values = np.array(pixels[channel][rows])
-                values[flips] = values[flips, :, ::-1]
-                out[..., at : at + self._count_planes(channel)] = layer.band_channels(values, px)
             elif layer.stored == np.uint8:
                 form_bytes(pixels[channel], rows, flips, layer.channel_of_bytes, at, out)
             else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -53,10 +52,7 @@ def format_croissant(card: DatasetCard, samples: pa.Schema, files: Mapping[str, 
         kind = {"name": "shards", "encodingFormat": _ENCODING_BY_SUFFIX[".parquet"], "includes": f"{SHARDS}/*.parquet"}
         sets.append({"@type": "cr:FileSet", "@id": "shards", **kind})
         layers = read_layers(card.layers, card.classes, Path())
-        patches = [
-            _patch_field(layer.name, math.prod(layer.patch_shape(card.patch_px)), layer.stored.kind)
-            for layer in layers.values()
-        ]
+        patches = [_patch_field(layer.name, card.patch_px**2, layer.stored.kind) for layer in layers.values()]
         columns = pa.schema([samples.field("sample_id"), samples.field("split"), *patches])
         about = "One record a sample with its patch, split by split: rows of the patch one after another."
         records.append(_describe_records("patches", about, columns, {"fileSet": {"@id": "shards"}}))

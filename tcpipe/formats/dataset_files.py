@@ -49,7 +49,7 @@ from tcpipe.terrain.layers import Layer, find_no_data_value, sort_layers
 
 FileFormat = Literal["zarr", "parquet"]
 LayerPixels = NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]
-"""Patches of one layer as they are stored, shape (N, px, px), or (N, bands, own px, own px)."""
+"""Patches of one layer as they are stored, shape (N, px, px)."""
 
 CARD = "dataset.json"
 CROISSANT = "croissant.json"
@@ -163,17 +163,14 @@ def make_zarr_writers(
     attributes = {"Conventions": "CF-1.11", "title": "patches of a tcpipe dataset, in the order of samples.parquet"}
     group = create_group(directory / PATCHES, attributes)
     for layer in pixels.layers.values():
-        patch, own = layer.patch_shape(px), f"{layer.name}_"
         add_array(
             group,
             layer.name,
-            shape=(n, *patch),
+            shape=(n, px, px),
             dtype=layer.stored,
-            chunks=(CHUNK_ROWS, *patch),
-            shards=(shard, *patch),
-            dimensions=("sample", *(f"{own}{axis}" for axis in ("band", "row", "column")))
-            if layer.bands
-            else ("sample", "row", "column"),
+            chunks=(CHUNK_ROWS, px, px),
+            shards=(shard, px, px),
+            dimensions=("sample", "row", "column"),
             fill_value=find_no_data_value(layer.stored),
             attributes={**make_cf_attributes(layer), "coordinates": "sample_id"},
             compression=compression,
@@ -209,12 +206,11 @@ def _open_layer_array(
     directory: Path, layer: Layer, samples: int, px: int, fetched: FetchedShards | None = None
 ) -> ShardedArray:
     """Return the array of a layer; `StoreError` if its description is not of so many patches of so many pixels."""
-    patch = layer.patch_shape(px)
     return open_sharded(
         directory / PATCHES / layer.name,
-        shape=(samples, *patch),
-        chunk_shape=(CHUNK_ROWS, *patch),
-        shard_shape=(_choose_shard_rows(samples), *patch),
+        shape=(samples, px, px),
+        chunk_shape=(CHUNK_ROWS, px, px),
+        shard_shape=(_choose_shard_rows(samples), px, px),
         dtype=np.dtype(layer.stored),
         fill=find_no_data_value(layer.stored),
         fetched=fetched,
@@ -346,7 +342,7 @@ class PatchFiles:
 
     def make_room(self, layer: str, rows: int) -> LayerPixels:
         """Return an empty array for so many stored patches of a layer."""
-        return np.empty((rows, *self.layers[layer].patch_shape(self.patch_px)), self.layers[layer].stored)
+        return np.empty((rows, self.patch_px, self.patch_px), self.layers[layer].stored)
 
     @property
     def piece_rows(self) -> int:
@@ -407,8 +403,7 @@ def open_patches(directory: Path, card: DatasetCard, fetched: FetchedShards | No
     if not (layers or card.maps):
         return PatchFiles(directory, {}, px, np.array([0, samples]))
     known = card.format in get_args(FileFormat)
-    uneven = any(layer.bands and (not layer.own_px or px % layer.own_px) for layer in layers.values())
-    if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES) or uneven:
+    if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES):
         raise DatasetError(
             f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card.format}: expected up to "
             f"{MOST_SAMPLES} of up to {MOST_PX} px, zarr or parquet"

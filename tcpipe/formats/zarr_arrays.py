@@ -178,20 +178,17 @@ class ShardedArray:
         shard = tuple(i // n for i, n in zip(index, per_shard, strict=True))
         return shard, tuple(i % n for i, n in zip(index, per_shard, strict=True))
 
-    def window(self, row0: int, row1: int, col0: int, col1: int, lead: tuple[int, ...] = ()) -> NDArray[Any]:
-        """Return rows ``row0:row1`` and columns ``col0:col1`` of the last two axes; `StoreError` as `chunk`.
-
-        ``lead`` are the places on the axes before, along which a chunk has the length 1.
-        """
+    def window(self, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
+        """Return rows ``row0:row1`` and columns ``col0:col1`` of the last two axes; `StoreError` as `chunk`."""
         high, wide = self.chunk_shape[-2:]
         row1, col1 = min(row1, self.shape[-2]), min(col1, self.shape[-1])
         out = np.empty((row1 - row0, col1 - col0), self.dtype)
         touched = list(product(range(row0 // high, -(-row1 // high)), range(col0 // wide, -(-col1 // wide))))
-        self.expect((*lead, *tile) for tile in touched)
+        self.expect(touched)
         for i, j in touched:
             top, left = max(i * high, row0), max(j * wide, col0)
             bottom, right = min((i + 1) * high, row1), min((j + 1) * wide, col1)
-            tile = self.chunk((*lead, i, j)).reshape(high, wide)
+            tile = self.chunk((i, j)).reshape(high, wide)
             part = tile[top - i * high : bottom - i * high, left - j * wide : right - j * wide]
             out[top - row0 : bottom - row0, left - col0 : right - col0] = part
         return out

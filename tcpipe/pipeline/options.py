@@ -114,7 +114,7 @@ class AddMapOptions:
     layers: Mapping[str, Files] | None = option(
         None,
         Option(
-            "Another raster, as layer NAME; several bands keep their own pixel size; repeatable.",
+            "Another raster of one band, as layer NAME; repeatable.",
             ("--layer",),
             "layers",
             "NAME=FILE",

@@ -30,7 +30,7 @@ from tcpipe.terrain.sampling import (
     count_corners_on,
     sample_patches,
 )
-from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, list_layers
+from tcpipe.terrain.tiles import MapReader, TilePool, choose_level
 
 Floats = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def check_model(model: Model, source: MapReader, *, needs_energy: bool = True) -
             "(evaluate and predict-path take this one, without --drive and --adapt)"
         )
     needed = model.card.layout.layers
-    there = list_layers(source, model.card.inputs.patch_m, model.card.inputs.patch_px)
+    there = source.layers
     if missing := [layer for layer in needed if layer not in there]:
         option = f"--{missing[0]}" if missing[0] in LAYERS else f"--layer {missing[0]}=FILE"
         option = "--ortho-bands rgb" if missing[0] in COLOURS else option

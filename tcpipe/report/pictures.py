@@ -235,7 +235,7 @@ class _Patches:
     def read(self, rows: NDArray[np.int64]) -> Mapping[str, NDArray[Any]]:
         """Return thinned patches of these rows by layer, (N, px, px), or (N, px, px, 3) of an orthophoto in colour."""
         place, piece = self.place[rows], self.piece[rows]
-        layers = [name for name, layer in self.files.layers.items() if not layer.bands]  # no picture of an embedding
+        layers = list(self.files.layers)
         stacks: dict[str, list[NDArray[np.generic]]] = {layer: [] for layer in layers}
         order = np.argsort(piece, kind="stable")
         for number in np.unique(piece).tolist():
@@ -300,7 +300,7 @@ def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[An
 
 def find_picture_folder(card: DatasetCard) -> tuple[str, int]:
     """Return the folder of the pictures of all patches, relative to the page, and their number."""
-    shown = sum("bands" not in layer for layer in card.layers.values())
+    shown = len(card.layers)
     layers = shown - (len(COLOURS) if set(COLOURS) <= set(card.layers) else 0)
     return f"{REPORT_PATCHES}/{card.inputs[:16]}", layers * -(-card.samples // PER_SHEET)
 

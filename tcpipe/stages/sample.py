@@ -27,7 +27,7 @@ from tcpipe.terrain.sampling import (
     make_patch_frames,
     sample_patches,
 )
-from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, find_map_projection, list_layers
+from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, find_map_projection
 
 Shifts = Mapping[str, tuple[float, float, float]]
 """By run: what is added to its positions to find their ground on a map, x and y, and the DRMS of that [m]."""
@@ -222,7 +222,7 @@ def sample_on_maps(
 
     Raises `TableError`, `MapError`: as `sample_segments`; the maps have not the same layers or classes, or are too far apart.
     """
-    check_same_layers(sources, config)
+    check_same_layers(sources)
     lost_by = np.full(segments.num_rows, Loss.OUTSIDE_MAP, np.uint32)
     waiting = np.arange(segments.num_rows)
     parts: list[Sampled] = []
@@ -252,10 +252,10 @@ def _project_to_first_map(sampled: Sampled, source: MapReader, first: MapReader)
     return placed
 
 
-def check_same_layers(sources: Sequence[MapReader], config: SampleConfig) -> None:
+def check_same_layers(sources: Sequence[MapReader]) -> None:
     """Raise `MapError` if the maps have not the same layers and classes: their patches could not be learned from together."""
     first, problems = sources[0], []
-    layers, *others = (list_layers(source, config.patch_m, config.patch_px) for source in sources)
+    layers, *others = (source.layers for source in sources)
     for other, theirs in zip(sources[1:], others, strict=True):
         if set(theirs) != set(layers):
             problems.append(
@@ -265,9 +265,9 @@ def check_same_layers(sources: Sequence[MapReader], config: SampleConfig) -> Non
             continue
         for name, layer in layers.items():
             its = theirs[name]
-            got, wanted = (f"{each.signature}{f', {each.stored}' if each.bands else ''}" for each in (its, layer))
-            if got != wanted:
-                problems.append(f"map {other.name}: {name} is {got}, but {wanted} in map {first.name}")
+            if its.signature != layer.signature:
+                what = f"{name} is {its.signature}, but {layer.signature}"
+                problems.append(f"map {other.name}: {what} in map {first.name}")
             elif layer.classes is not None and its.classes is not None and its.classes != layer.classes:
                 different = "; ".join(its.classes.differences(layer.classes))
                 subject = "its classes" if name == "terrain" else f"its classes of {name}"

@@ -10,9 +10,8 @@ relative      bilinear        steps above the patch's       the same, in its ran
 ============  ==============  ============================  =======================================
 
 The paper has one of each: ortho O / 255, terrain (C - 1) / (c - 1), height (H - min H) / 1 m, all clipped to [0, 1]. A user's own rasters
-are continuous or categorical (docs/how-to/your-maps.md). A continuous one of several bands (an embedding) keeps its own pixel size in the
-map and in patches; each band is a channel of the tensor, scaled by its own range. A pixel without data in any layer is 0 in every channel;
-one without data in several bands in theirs. Only a recipe with ``min_valid_fraction`` below 1 keeps such pixels.
+are continuous or categorical (docs/how-to/your-maps.md). A pixel without data in any layer is 0 in every channel; only a recipe with
+``min_valid_fraction`` below 1 keeps such pixels.
 """
 
 from __future__ import annotations
@@ -151,7 +150,7 @@ Pixels: TypeAlias = NDArray[np.uint8 | np.uint16 | np.float16 | np.float32 | np.
 """Pixels of a layer: bytes or floats in a map, steps above the lowest pixel in a patch."""
 
 Kind = Literal["continuous", "categorical", "relative"]
-Stack = Literal["relative", "floats", "greys", "classes", "bands"]
+Stack = Literal["relative", "floats", "greys", "classes"]
 
 LAYERS = ("ortho", "terrain", "height")
 """The paper's order of channels: O, C, H."""
@@ -166,9 +165,6 @@ STACKS: dict[Stack, type[np.generic]] = {
     "classes": np.uint8,
 }
 """Layers of the map's own pixels that are sampled together, and their type in a map."""
-
-MAX_BANDS = 512
-"""Largest number of bands of one layer."""
 
 HEIGHT_STEP_M = 0.0005
 """One step of a stored height [m]."""
@@ -206,39 +202,20 @@ class Layer:
     """Values that become 0 and 1 in the tensor [unit]."""
     classes: ClassTable | None = None
     """Class table of a categorical layer."""
-    bands: tuple[tuple[float, float], ...] = ()
-    """Values of each band that become 0 and 1, of a layer of several bands [unit]."""
-    pixel_size_m: float = 0.0
-    """Pixel size in the map of a layer of several bands [m]."""
-    own_px: int = 0
-    """Side of the patches of a layer of several bands [px], a divisor of that of the tensor."""
-
-    def patch_shape(self, patch_px: int) -> tuple[int, ...]:
-        """Return the shape of a stored patch: (px, px), or (bands, own px, own px)."""
-        return (len(self.bands), self.own_px, self.own_px) if self.bands else (patch_px, patch_px)
-
-    def at_patch(self, patch_m: float, patch_px: int) -> Layer:
-        """Return a layer of several bands with the coarsest patches that keep its resolution; another one as it is."""
-        if not self.bands:
-            return self
-        wanted = FINE_ENOUGH * min(patch_m / self.pixel_size_m, patch_px)
-        return replace(self, own_px=next(n for n in range(1, patch_px + 1) if patch_px % n == 0 and n >= wanted))
 
     def compute_means(self, pixels: Pixels) -> NDArray[np.float64]:
-        """Return the mean of each band of stored patches, or the share of each class, shape (N, bands or classes); without data: 0."""
+        """Return the mean of stored patches, or the share of each class, shape (N, 1 or classes); without data: 0."""
         if self.classes is not None:
             ids = np.arange(1, self.classes.count + 1)
             return np.stack([np.mean(pixels == class_id, axis=(1, 2)) for class_id in ids], axis=1)
-        values = pixels.reshape(len(pixels), max(len(self.bands), 1), -1).astype(np.float64)
+        values = pixels.reshape(len(pixels), 1, -1).astype(np.float64)
         has_data = np.isfinite(values) if np.isnan(self.nodata) else values != self.nodata
         return np.asarray(np.where(has_data, values, 0.0).sum(axis=2) / np.maximum(has_data.sum(axis=2), 1))
 
     @property
     def signature(self) -> str:
         """Properties, other than classes, that layers of one name share wherever their patches are used together."""
-        return f"{self.kind} [{self.unit}]" + (
-            f", {len(self.bands)} bands, {self.own_px} px a patch" * bool(self.bands)
-        )
+        return f"{self.kind} [{self.unit}]"
 
     @property
     def nodata(self) -> float:
@@ -248,8 +225,6 @@ class Layer:
     @property
     def stack(self) -> Stack:
         """Return what it is sampled together with."""
-        if self.bands:
-            return "bands"
         if self.kind == "continuous":
             return "greys" if self.mapped == np.uint8 else "floats"
         return "relative" if self.kind == "relative" else "classes"
@@ -271,24 +246,11 @@ class Layer:
         width = (self.high - self.low) or 1.0
         return self.step / width, -self.low / width
 
-    def band_channels(self, pixels: Pixels, patch_px: int) -> NDArray[np.float32]:
-        """Return patches of several bands, (N, bands, own px, own px), as channels in [0, 1], (N, patch_px, patch_px, bands)."""
-        low, high = np.array(self.bands, np.float32).T[:, None, None, :]
-        scaled = (np.moveaxis(pixels, 1, 3).astype(np.float32) - low) / np.where(
-            high > low, high - low, np.float32(1.0)
-        )
-        scaled = np.nan_to_num(np.clip(scaled, 0.0, 1.0), nan=0.0)
-        times = patch_px // scaled.shape[1]
-        return np.asarray(scaled.repeat(times, axis=1).repeat(times, axis=2))
-
 
 def find_no_data_value(dtype: np.dtype[np.generic]) -> float:
     """Return what stands for no data in a map's pixels of a type."""
     return float("nan") if dtype.kind == "f" else 0
 
-
-FINE_ENOUGH = 0.95
-"""Share of a layer's resolution that patches keep at least: rounded pixel sizes count as one."""
 
 _BYTE, _STEPS, _FLOAT = (np.dtype(kind) for kind in (np.uint8, np.uint16, np.float32))
 
@@ -319,21 +281,6 @@ def make_continuous_layer(name: str, *, unit: str, low: float, high: float) -> L
     return Layer(name, "continuous", name.replace("_", " "), _FLOAT, _FLOAT, unit=unit or "1", low=low, high=high)
 
 
-def make_banded_layer(  # noqa: PLR0917
-    name: str,
-    unit: str,
-    bands: Sequence[tuple[float, float]],
-    dtype: str,
-    pixel_size_m: float,
-    own_px: int = 0,
-) -> Layer:
-    """Return a user's layer of several bands, kept as float16 or float32; the last three are fields of `Layer`."""
-    low, high = min(band[0] for band in bands), max(band[1] for band in bands)
-    layer, kept = make_continuous_layer(name, unit=unit, low=low, high=high), np.dtype(dtype)
-    ranges = tuple(bands)
-    return replace(layer, mapped=kept, stored=kept, bands=ranges, pixel_size_m=pixel_size_m, own_px=own_px)
-
-
 def make_categorical_layer(name: str, classes: ClassTable) -> Layer:
     """Return a categorical layer with classes of its own."""
     long_name = f"{name.replace('_', ' ')} class id"
@@ -359,10 +306,6 @@ def join_layers(maps: Sequence[Mapping[str, Layer]]) -> dict[str, Layer]:
             layer,
             low=min(each[name].low for each in maps),
             high=max(each[name].high for each in maps),
-            bands=tuple(
-                (min(low for low, _ in band), max(high for _, high in band))
-                for band in zip(*(each[name].bands for each in maps), strict=True)
-            ),
         )
         for name, layer in maps[0].items()
     }

@@ -12,7 +12,6 @@ patch is a metre of *ground*: the projected chord over ``chord_m`` is the map's 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
 from tcpipe.tables.findings import read_threshold
-from tcpipe.terrain.layers import FINE_ENOUGH, HEIGHT_NODATA, HEIGHT_STEP_M, STACKS, group_stacks
+from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M, STACKS, group_stacks
 from tcpipe.terrain.sampling_kernel import Ground, Stacks, sample_tiles
 from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_tile, read_window
@@ -37,9 +36,6 @@ def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
     return np.asarray(steps * HEIGHT_STEP_M)
 
 
-_BAND_VALUES = 2_000_000
-"""Values of a layer of several bands that are interpolated at once: 8 MB each."""
-
 _MOVED_ROWS = 128
 """Patches moved at once: they stay in the processor's cache on the way."""
 
@@ -48,10 +44,10 @@ _MOVED_ROWS = 128
 class Patches:
     """N sampled patches.
 
-    ``pixels`` are the layers that the map has, by name, (N, S, S), as `tcpipe.terrain.layers` says; those of several bands are
-    (N, bands, own px, own px). The other arrays have shape (N,): smallest height [m], slopes of the fitted plane [rad], valid share, share
-    clipped by the tensor, majority class of terrain under the chord (0: none) and its share. ``profile_m``: heights in the middle of rear
-    edge, patch and front edge above the smallest [m], NaN without data, (N, 3).
+    ``pixels`` are the layers that the map has, by name, (N, S, S), as `tcpipe.terrain.layers` says. The other arrays have shape (N,):
+    smallest height [m], slopes of the fitted plane [rad], valid share, share clipped by the tensor, majority class of terrain under the
+    chord (0: none) and its share. ``profile_m``: heights in the middle of rear edge, patch and front edge above the smallest [m], NaN
+    without data, (N, 3).
     """
 
     pixels: Mapping[str, NDArray[Any]]
@@ -124,17 +120,12 @@ def sample_patches(
     for chosen in group_by_tile(level.grid.px_from_xy(frames.centre_xy_m), level):
         pool.hold(boxes[chosen])
         sample_tiles(pool.tiles, ground, chosen, out)
-    stats = out.stats
     found = {
         name: out.relative if stack == "relative" else getattr(out, stack)[number]
         for stack, names in stacks.items()
         for number, name in enumerate(names)
     }
-    for name in level.banded:
-        found[name] = _sample_bands(level, name, frames, patch_m=patch_m, patch_px=patch_px)
-        known = np.isfinite(found[name]).mean(axis=(1, 2, 3)) if chord_m.size else stats[:, 3]
-        stats[:, 3] = np.minimum(stats[:, 3], known)
-    height_m, slope_rad, cross_slope_rad, valid, clipped, terrain_class, purity = stats.T
+    height_m, slope_rad, cross_slope_rad, valid, clipped, terrain_class, purity = out.stats.T
     height_m, terrain_class = height_m + level.height_reference_m, terrain_class.astype(np.uint8)
     profile_m = _compute_profile(out.relative)
     return Patches(found, height_m, slope_rad, cross_slope_rad, valid, clipped, terrain_class, purity, profile_m)
@@ -145,47 +136,6 @@ def _compute_profile(height: NDArray[np.uint16]) -> FloatArray:
     middle = slice((height.shape[1] - 1) // 2, height.shape[1] // 2 + 1)
     along_m = np.where((line := height[:, middle]) == HEIGHT_NODATA, np.nan, line * HEIGHT_STEP_M).mean(axis=1)
     return np.stack([along_m[:, part].mean(axis=1) for part in (slice(1), middle, slice(-1, None))], axis=1)
-
-
-def _sample_bands(level: MapReader, name: str, frames: PatchFrames, *, patch_m: float, patch_px: int) -> NDArray[Any]:
-    """Return patches of all bands of a layer, bilinear, shape (N, bands, own px, own px); NaN where a tap has no data.
-
-    A patch whose pixels are wider than the layer's is averaged over so many points that none of these is skipped.
-    """
-    source, count = level.banded[name], len(frames.centre_xy_m)
-    layer = source.layer.at_patch(patch_m, patch_px)
-    parts = math.ceil(FINE_ENOUGH * patch_m / layer.own_px / layer.pixel_size_m)
-    side = layer.own_px * parts
-    pixels = map_px_from_patch(frames, source.grid, patch_m=patch_m, patch_px=side)
-    out = np.empty((count, *layer.patch_shape(patch_px)), layer.stored)
-    together = max(_BAND_VALUES // (len(layer.bands) * side**2), 1)
-    row, column = np.mgrid[:side, :side][..., None]
-    beyond = np.array([source.grid.cols, source.grid.rows]) + 1.0
-    for group in group_by_tile(source.grid.px_from_xy(frames.centre_xy_m), source):
-        origin, along, down = (pixels[group, None, None, n : n + 2] for n in (0, 2, 4))
-        corners = origin + (side - 1) * (np.arange(2)[:, None, None] * along + np.arange(2)[:, None] * down)
-        corners = np.clip(np.nan_to_num(corners, nan=-2.0), -2.0, beyond).reshape(-1, 2)
-        first, last = np.floor(corners.min(axis=0)).astype(int) - 1, np.ceil(corners.max(axis=0)).astype(int) + 2
-        (left, top), (right, bottom) = first.tolist(), last.tolist()
-        window = np.moveaxis(read_window(level, name, top, bottom, left, right), 0, 2).astype(np.float32, order="C")
-        for start in range(0, len(group), together):
-            part = slice(start, start + together)
-            px = origin[part] + column * along[part] + row * down[part]
-            found = _interpolate_bands(window, np.clip(np.nan_to_num(px, nan=-2.0), -2.0, beyond) - first)
-            cells = found.reshape(len(found), -1, layer.own_px, parts, layer.own_px, parts)
-            out[group[part]] = cells.mean(axis=(3, 5))
-    return out
-
-
-def _interpolate_bands(window: NDArray[np.float32], px: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return all bands at positions in a window, (N, S, S, 2), as (N, bands, S, S); a tap of weight zero need not have data."""
-    low = np.floor(px).astype(np.int64)
-    weight = (px - low).astype(np.float32)
-    (x0, y0), (x1, y1) = (np.moveaxis(corner, 3, 0) for corner in (low, low + (weight > 0.0)))
-    across, along = weight[..., :1], weight[..., 1:]
-    upper = window[y0, x0] + across * (window[y0, x1] - window[y0, x0])
-    lower = window[y1, x0] + across * (window[y1, x1] - window[y1, x0])
-    return np.asarray(np.moveaxis(upper + along * (lower - upper), 3, 1))
 
 
 def _compute_boxes(

@@ -143,20 +143,6 @@ def choose_grid(
     return _cover(format_crs(crs), (x_min, y_min, x_max, y_max), (x_base, y_base), pitch)
 
 
-def choose_layer_grid(grid: MapGrid, raster: Georeference, crs: CRS) -> MapGrid:
-    """Return the grid of a layer that keeps its raster's pixels: over the map and one pixel around; the map's where they are not larger."""
-    pitch = _compute_pixel_side(raster, crs)
-    if pitch <= grid.pixel_size_m / _FINER:
-        return grid
-    corners, base = raster.outline(), (grid.x_min_m, grid.y_max_m)
-    if raster.is_square_in(crs):
-        base = float(corners[:, 0].min()), float(corners[:, 1].max())
-    else:
-        pitch = float(f"{pitch:.3g}")
-    x_min, y_min, x_max, y_max = grid.bounds_m
-    return _cover(grid.crs, (x_min - pitch, y_min - pitch, x_max + pitch, y_max + pitch), base, pitch)
-
-
 def _cover(crs: str, bounds_m: tuple[float, float, float, float], base_m: tuple[float, float], pitch: float) -> MapGrid:
     """Return the smallest grid over ``bounds_m`` that has a corner of a pixel at ``base_m``."""
     (x_min, y_min, x_max, y_max), (x_base, y_base), slack = bounds_m, base_m, 1e-3

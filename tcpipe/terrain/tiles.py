@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from typing import Any, Self
 
@@ -26,17 +25,6 @@ _STRIP_TILES = CACHED_TILES // 3 - 3
 """Three rows of a strip of the map are touched between two uses of a tile. So wide, 15,000 px, most maps are one strip."""
 
 
-@dataclass(frozen=True, slots=True)
-class BandReader:
-    """A layer of several bands on a grid of its own, with tiles as those of `MapReader`."""
-
-    layer: Layer
-    grid: MapGrid
-    tile_px: int
-    read: Callable[[int, int, int, int], NDArray[Any]]
-    """Returns a window (first row, last row, first column, last column) of all bands, (bands, rows, columns), NaN without data."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapReader(ABC):
     """A map: its grid, classes, layers, and windows of each layer."""
@@ -53,13 +41,10 @@ class MapReader(ABC):
     """Reference of the stored heights [m]."""
     factors: tuple[int, ...]
     """Levels that `at` gives: how many pixels of the full map a pixel of each spans, rising from 1."""
-    banded: Mapping[str, BandReader]
-    """Its layers of several bands by name; the same at every factor."""
 
     def select(self, layers: Collection[str]) -> Self:
         """Return the map with these of its layers alone; ``height`` is one of them."""
-        kept = {name: layer for name, layer in self.layers.items() if name in layers}
-        return replace(self, layers=kept, banded={name: bands for name, bands in self.banded.items() if name in layers})
+        return replace(self, layers={name: layer for name, layer in self.layers.items() if name in layers})
 
     @abstractmethod
     def at(self, factor: int) -> MapReader:
@@ -81,12 +66,6 @@ class MapReader(ABC):
         """Put the tile in row i and column j into ``out``, contiguous, `tile_px` each way; beyond the map it holds no data."""
 
 
-def list_layers(source: MapReader, patch_m: float, patch_px: int) -> dict[str, Layer]:
-    """Return all layers of a map, those of several bands last, as patches of a size [m] and pixels have them."""
-    banded = {name: bands.layer.at_patch(patch_m, patch_px) for name, bands in source.banded.items()}
-    return {**source.layers, **banded}
-
-
 def choose_level(source: MapReader, pixel_size_m: float) -> MapReader:
     """Return the map's level whose pixels are nearest below ``pixel_size_m`` [m]: coarse enough not to alias, fine enough to show all."""
     factor = choose_factor(source.factors, source.grid.pixel_size_m, pixel_size_m)
@@ -99,7 +78,7 @@ def find_map_projection(source: MapReader, gnss_crs: str) -> Projection:
     return Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, compute_area(crs, source.grid.bounds_m))
 
 
-def group_by_tile(px: NDArray[np.float64], source: MapReader | BandReader) -> Iterator[NDArray[np.int64]]:
+def group_by_tile(px: NDArray[np.float64], source: MapReader) -> Iterator[NDArray[np.int64]]:
     """Yield the indices of pixel positions, shape (N, 2), by tile; within a tile in Z-order.
 
     Tiles come row by row inside strips narrow enough that a tile is still held when the rows above and below want it.
@@ -116,17 +95,12 @@ def group_by_tile(px: NDArray[np.float64], source: MapReader | BandReader) -> It
 def read_window(  # noqa: PLR0917
     source: MapReader, layer: str, row0: int, row1: int, col0: int, col1: int
 ) -> NDArray[Any]:
-    """Return a window of a layer that may reach beyond the map, where it holds no data; (bands, rows, columns) of one of several."""
-    bands = source.banded.get(layer)
-    definition, grid = (source.layers[layer], source.grid) if bands is None else (bands.layer, bands.grid)
-    read = partial(source.read, layer) if bands is None else bands.read
-    lead = (len(definition.bands),) if definition.bands else ()
-    out: NDArray[Any] = np.full(
-        (*lead, row1 - row0, col1 - col0), find_no_data_value(definition.mapped), definition.mapped
-    )
+    """Return a window of a layer that may reach beyond the map, where it has no data."""
+    dtype, grid = source.layers[layer].mapped, source.grid
+    out: NDArray[Any] = np.full((row1 - row0, col1 - col0), find_no_data_value(dtype), dtype)
     top, bottom, left, right = max(row0, 0), min(row1, grid.rows), max(col0, 0), min(col1, grid.cols)
     if top < bottom and left < right:
-        out[..., top - row0 : bottom - row0, left - col0 : right - col0] = read(top, bottom, left, right)
+        out[top - row0 : bottom - row0, left - col0 : right - col0] = source.read(layer, top, bottom, left, right)
     return out
 
 

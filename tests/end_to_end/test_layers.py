@@ -1,11 +1,7 @@
 """Rasters of a user's own, from add-map to a tensor: against closed forms, in both formats, with their classes."""
 
 import json
-import re
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,14 +34,6 @@ def moisture(x, y):
     return 30.0 + 0.5 * (x - WORLD.x_m) - 0.3 * (y - WORLD.y_m)
 
 
-BANDS = np.arange(1, 10)[:, None, None]
-
-
-def embedding(x, y):
-    """Nine bands, linear; band 3 differs from the rest in sign."""
-    return np.where(BANDS == 3, -1.0, 1.0) * (0.125 * BANDS * (x - WORLD.x_m) - 0.25 * (y - WORLD.y_m))
-
-
 def canopy(x, y):
     """Raster values: 40 in the west, 7 in the east."""
     return np.where(x < WORLD.x_m, 40, 7)
@@ -60,9 +48,9 @@ def site(tmp_path_factory):
     where = Affine(PITCH_M, 0, WORLD.x_m - 20.0, 0, -PITCH_M, WORLD.y_m + 20.0)
     write_tif(here / "moisture.tif", moisture(x, y).astype(np.float32)[None], WORLD.crs, where)
     write_tif(here / "canopy.tif", canopy(x, y).astype(np.uint8)[None], WORLD.crs, where)
-    x, y = WORLD.centres(0.5)
-    where = Affine(0.5, 0, WORLD.x_m - 20.0, 0, -0.5, WORLD.y_m + 20.0)
-    write_tif(here / "embedding.tif", embedding(x, y).astype(np.float32), WORLD.crs, where, nbits=16)
+    for name, place in (("east", x - WORLD.x_m), ("north", y - WORLD.y_m)):
+        values = np.broadcast_to(place, moisture(x, y).shape)
+        write_tif(here / f"{name}.tif", values.astype(np.float32)[None], WORLD.crs, where)
     with rasterio.open(here / "moisture.tif", "r+") as raster:
         raster.set_band_unit(1, "%")
     (here / "canopy.csv").write_text("value,id,name,traversable\n40,1,open,yes\n7,2,closed canopy,yes\n")
@@ -88,12 +76,11 @@ def add(here, name, *more, ortho="ortho.tif"):
 @pytest.fixture(scope="module")
 def datasets(site):
     layers = ["--layer", f"moisture={site}/moisture.tif", "--layer", f"canopy={site}/canopy.tif"]
-    layers += ["--layer", f"embedding={site}/embedding.tif"]
+    layers += ["--layer", f"east={site}/east.tif", "--layer", f"north={site}/north.tif"]
     own = [*layers, "--categorical", f"canopy={site}/canopy.csv", "--ortho-bands", "rgb"]
     for name, more in (("plain", []), ("own", own)):
         result = add(site, name, *more, ortho="colour.tif")
         assert result.exit_code == 0, result.output
-    assert "embedding   100 % covered, from embedding.tif: 9 bands of 0.5 m (float16), -27." in result.output
     for out, name, file_format in (("plain", "plain", "zarr"), ("zarr", "own", "zarr"), ("parquet", "own", "parquet")):
         built = run(site, "build-dataset", site / out, "--map", name, "--format", file_format, "--holdout", "sample")
         assert built.exit_code in {0, 3}, built.output
@@ -134,32 +121,6 @@ def test_every_pixel_is_what_lies_there(datasets, name):
     np.testing.assert_array_equal(batch, train.patches[:8])
 
 
-@pytest.mark.parametrize("name", ["zarr", "parquet"])
-def test_bands_keep_their_own_resolution_and_type(datasets, name):
-    train = tcpipe.open_dataset(datasets / name, layers=["embedding"])["train"]
-    samples = train._columns.table()
-    ends = [to_world(*(samples[f"{end}_{axis}_deg"].to_numpy() for axis in ("lon", "lat"))) for end in ("start", "end")]
-    (x0, y0), (x1, y1) = ends
-    row, col = np.mgrid[:2, :2] * 0.5 - 0.25  # half-metre pixels: two each way in a patch of a metre
-    east, north = (of[:, None, None] for of in (x1 - x0, y1 - y0))
-    x = (x0 + x1)[:, None, None] / 2 + col * east + row * north
-    y = (y0 + y1)[:, None, None] / 2 + col * north - row * east
-    stored = train.layers(np.arange(len(train)))["embedding"]
-    assert (stored.shape, stored.dtype) == ((len(train), 9, 2, 2), np.float16)
-    np.testing.assert_allclose(stored, np.stack([embedding(*at) for at in zip(x, y, strict=True)]), atol=0.03)
-    assert train.patches.shape == (len(train), 40, 40, 9)
-    low, high = np.array(train._card.layers["embedding"]["bands"]).T
-    assert np.abs(high + low).max() < 0.5  # each band has its own range
-    assert np.allclose(high, 0.125 * BANDS[:, 0, 0] * 19.75 + 0.25 * 19.75, atol=0.03)
-    scaled = (stored.astype(float) - low[:, None, None]) / (high - low)[:, None, None]
-    np.testing.assert_allclose(train.patches[:, ::20, ::20], np.moveaxis(scaled, 1, 3), atol=1e-5)
-    np.testing.assert_array_equal(train.patches[:, 19, 39], train.patches[:, 0, 20])
-    batch, _ = next(iter(train.batches(8, from_disk=True)))
-    np.testing.assert_array_equal(batch, train.patches[:8])
-    mirrored = train.view.form.form({"embedding": stored}, np.arange(3), np.array([True, False, True]))
-    np.testing.assert_array_equal(mirrored, [train.patches[0, ::-1], train.patches[1], train.patches[2, ::-1]])
-
-
 def to_world(lon, lat):
     import pyproj
 
@@ -171,14 +132,13 @@ def test_all_that_describes_a_dataset_tells_of_them(datasets):
         assert verify(datasets / name).problems == ()
     patches = xr.open_zarr(datasets / "zarr" / "patches.zarr")
     assert patches.moisture.attrs["units"] == "%"
-    assert patches.embedding.dims == ("sample", "embedding_band", "embedding_row", "embedding_column")
     assert patches.canopy.attrs["flag_meanings"] == "open closed_canopy"
     fields = json.loads((datasets / "parquet" / "croissant.json").read_text())["recordSet"][1]["field"]
     kinds = {field["name"]: field["dataType"] for field in fields}
     assert (kinds["moisture"], kinds["canopy"]) == ("sc:Float", "sc:Integer")
     assert "canopy" in (datasets / "zarr" / "report.html").read_text()
     listed = CliRunner().invoke(cli, ["inspect", str(map_path(datasets / "store", "own"))]).output
-    assert all(name in listed for name in ("moisture", "canopy", "ortho_red", "embedding"))
+    assert all(name in listed for name in ("moisture", "canopy", "ortho_red"))
     sample_id = tcpipe.open_dataset(datasets / "zarr")["train"].column("sample_id")[0]
     assert explain(sample_id, dataset=datasets / "zarr", store=datasets / "store").facts.map.name == "own"
 
@@ -227,7 +187,7 @@ def test_a_raster_s_own_names_are_its_classes(site, tmp_path):
         (
             ["--layer", "m={}/colour.tif", "--categorical", "m"],
             1,
-            "has bands of red, green and blue, expected one of class values",
+            "expected one of class values",
         ),
         (["--layer", "m={}/canopy.tif", "--categorical", "m"], 1, "does not define the meaning of its values"),
         (
@@ -256,10 +216,10 @@ PAPER = "ortho,terrain,height"
 
 @pytest.fixture(scope="module")
 def models(datasets):
-    """Models of the paper's layers, with the embedding, which tells the place, and with layers that tell little of it."""
+    """Models of the paper's layers, with those of the place, on which the velocity depends, and with layers that tell little of it."""
     for name, layers in (
         ("plain", PAPER),
-        ("bands", f"{PAPER},embedding"),
+        ("placed", f"{PAPER},east,north"),
         ("idle", f"{PAPER},canopy_one_hot,ortho_red"),
     ):
         more = ["--model", "boosting", "--layers", layers, "-q"]
@@ -275,11 +235,11 @@ def error_mps(here, name, dataset="zarr"):
     return float(np.sqrt(np.mean((said - test.labels[:, 1]) ** 2)))
 
 
-def test_bands_that_tell_the_cost_lower_the_error_of_held_out_samples(models):
-    plain, bands, idle = (error_mps(models, name) for name in ("plain", "bands", "idle"))
-    assert bands < 0.75 * plain
+def test_layers_that_tell_the_cost_lower_the_error_of_held_out_samples(models):
+    plain, placed, idle = (error_mps(models, name) for name in ("plain", "placed", "idle"))
+    assert placed < 0.75 * plain
     assert idle > 0.9 * plain
-    assert error_mps(models, "bands", "parquet") == pytest.approx(bands, rel=1e-6)
+    assert error_mps(models, "placed", "parquet") == pytest.approx(placed, rel=1e-6)
 
 
 def test_a_model_says_which_layers_it_takes(datasets, tmp_path, caplog):
@@ -289,7 +249,8 @@ def test_a_model_says_which_layers_it_takes(datasets, tmp_path, caplog):
     with caplog.at_level("WARNING", "tcpipe"):
         _report_layers(tcpipe.open_dataset(datasets / "zarr"), PAPER.split(","), is_chosen=False)
     assert (
-        "does not use canopy, embedding, moisture; to use it: --layers ortho,terrain,height,canopy,emb" in caplog.text
+        "does not use canopy, east, moisture, north; to use it: --layers ortho,terrain,height,canopy,east"
+        in caplog.text
     )
     for layers, model, line in (("ortho,soil", "boosting", "requested channels: soil"), (PAPER, "physics", "no patch")):
         more = ["--model", model, "--layers", layers]
@@ -302,40 +263,38 @@ def test_costs_need_the_layers_of_the_model(models):
     said = {}
     for name in ("own", "plain"):
         more = ["--map", name, "--cell-size", "2"]
-        said[name] = run(models, "cost-map", models / "model-bands", models / f"cost-{name}", *more)
+        said[name] = run(models, "cost-map", models / "model-placed", models / f"cost-{name}", *more)
     assert said["own"].exit_code == 0, said["own"].output
     assert isinstance(said["plain"].exception, TcpipeError)
     (line,) = said["plain"].exception.problems
     assert line.endswith(
-        "has no embedding, which model "
-        + str(models / "model-bands")
-        + " needs; add the map with --layer embedding=FILE"
+        "has no east, north, which model " + str(models / "model-placed") + " needs; add the map with --layer east=FILE"
     )
 
 
-def test_a_network_takes_a_channel_for_each_band(datasets, tmp_path):
+def test_a_network_takes_a_channel_for_each_layer_and_class(datasets, tmp_path):
     pytest.importorskip("torch")
-    options = ["--model", "resnet18", "--width", "16", "--epochs", "1", "--layers", "height,embedding,canopy_one_hot"]
+    options = ["--model", "resnet18", "--width", "16", "--epochs", "1", "--layers", "height,moisture,canopy_one_hot"]
     trained = CliRunner().invoke(cli, ["train", str(datasets / "zarr"), str(tmp_path / "model"), *options])
     assert trained.exit_code == 0, trained.output
     model, test = load_model(tmp_path / "model"), tcpipe.open_dataset(datasets / "zarr")["test"]
-    assert len(model.card.inputs.planes) == 1 + 9 + 2
+    assert len(model.card.inputs.planes) == 1 + 1 + 2
     patches = test.with_layout(model.card.layout).patches[:20]
     other = patches.copy()
-    other[..., 5] = 1.0 - other[..., 5]  # one band alone
+    other[..., 1] = 1.0 - other[..., 1]
     assert np.abs(model.predict(patches).mean - model.predict(other).mean).max() > 0.0
 
 
 def test_ground_unlike_that_of_training_in_a_layer_of_one_s_own_is_named(models):
-    """A band far from all training samples, or a class that none had; the same patches as in training are inside."""
-    model = load_model(models / "model-bands")
-    split = tcpipe.open_dataset(models / "zarr")["train"].with_channels("embedding")
-    known, layer = model.card.training_range.layers["embedding"], model.card.layout.known["embedding"]
-    patches = split.layers(np.arange(len(split)))["embedding"]
+    """A mean far from all training samples, or a class that none had; the same patches as in training are inside."""
+    model = load_model(models / "model-placed")
+    split = tcpipe.open_dataset(models / "zarr")["train"].with_channels("east")
+    known, layer = model.card.training_range.layers["east"], model.card.layout.known["east"]
+    patches = split.layers(np.arange(len(split)))["east"]
     inside = known.compute_distance(layer.compute_means(patches))
     assert inside.max() == pytest.approx(known.largest)
     other = patches.astype(np.float32)
-    other[:, 3] += 3.0 * (other[:, 3].max() - other[:, 3].min())
+    other += 3.0 * (other.max() - other.min())
     assert (known.compute_distance(layer.compute_means(other)) > known.largest).all()
     classes = Layer("x", "categorical", "x", np.dtype(np.uint8), np.dtype(np.uint8), classes=PAPER_CLASSES)
     seen = LayerRange.estimate(classes.compute_means(np.full((5, 2, 2), 4, np.uint8)))
@@ -344,32 +303,9 @@ def test_ground_unlike_that_of_training_in_a_layer_of_one_s_own_is_named(models)
 
 
 def test_an_evaluation_takes_the_layers_of_the_model(models, tmp_path):
-    result = CliRunner().invoke(cli, ["evaluate", *map(str, (models / "model-bands", models / "zarr", tmp_path / "e"))])
+    result = CliRunner().invoke(
+        cli, ["evaluate", *map(str, (models / "model-placed", models / "zarr", tmp_path / "e"))]
+    )
     assert result.exit_code in {0, 3}, result.output
     found = json.loads((tmp_path / "e" / "evaluation.json").read_text())
     assert found
-
-
-def test_the_page_on_embeddings_runs_as_it_stands(site, tmp_path, monkeypatch):
-    """The example and its commands, in order; one run is there, so that samples are held out instead of drives."""
-    docs = Path(__file__).parents[2] / "docs"
-    (commands,) = re.findall(
-        r"^```\n(python embedding.*?)^```$", (docs / "how-to/train.md").read_text(), re.DOTALL | re.MULTILINE
-    )
-    shutil.copy(docs / "examples/embedding.py", tmp_path)
-    for name in ("height", "ortho", "terrain"):
-        shutil.copy(site / f"{name}.tif", tmp_path)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("TCPIPE_STORE", str(site / "store"))
-    for command in commands.replace("--holdout run", "--holdout sample").splitlines():
-        program, *arguments = command.split()
-        if program == "python":
-            subprocess.run([sys.executable, *arguments], check=True)
-        else:
-            result = CliRunner().invoke(cli, arguments)
-            assert result.exit_code in {0, 3}, result.output
-    with rasterio.open("embedding.tif") as raster:
-        assert (raster.count, raster.res) == (12, (0.5, 0.5))
-    assert tcpipe.open_dataset("dataset", layers=["embedding"])["train"].patches.shape[3] == 12
-    for name in ("with", "without"):
-        assert Path(f"evaluation-{name}/evaluation.json").is_file()

@@ -10,7 +10,6 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from pyproj import CRS
 
 from tcpipe.errors import MapError
@@ -34,7 +33,6 @@ from tcpipe.terrain.layers import (
     Layer,
     TerrainClass,
     find_named_scheme,
-    make_banded_layer,
     make_categorical_layer,
     make_continuous_layer,
     make_own_scheme,
@@ -42,11 +40,9 @@ from tcpipe.terrain.layers import (
 )
 from tcpipe.terrain.projection import parse_crs
 from tcpipe.terrain.target_grid import (
-    MAX_PIXELS,
     MapGrid,
     choose_crs,
     choose_grid,
-    choose_layer_grid,
     find_projection,
 )
 
@@ -68,7 +64,7 @@ class MoreLayers:
     """Layers of a map in addition to height, ortho and terrain."""
 
     files: Mapping[str, Files] = field(default_factory=dict)
-    """Rasters by the layer's name; those of several bands keep their own pixels."""
+    """Rasters by the layer's name."""
     categorical: Mapping[str, Path | None] = field(default_factory=dict)
     """Those of them whose values are classes, and their class tables; None: the raster's own names say what its values mean."""
     ortho_bands: OrthoBands = "grey"
@@ -117,47 +113,27 @@ def build_map(
         map_crs = choose_crs(ground, wanted)
         others = [rasters[role].georeference for role in ("ortho", "terrain") if role in rasters]
         grid = choose_grid(ground, others, map_crs, pixel_size_m)
-        made = {role: _make_sources(raster, schemes, grid, map_crs, name) for role, raster in rasters.items()}
-        sources: dict[str, Sequence[LayerSource]] = {role: bands for role, bands in made.items() if len(bands) == 1}
+        sources: dict[str, LayerSource] = {
+            role: _make_source(raster, schemes, grid, map_crs) for role, raster in rasters.items()
+        }
         if drawn:
-            sources["terrain"] = (place_polygons(drawn, scheme, map_crs, grid),)
-        sources |= {role: bands for role, bands in made.items() if len(bands) > 1}
-        layers = {role: bands[0].layer for role, bands in sources.items()}
+            sources["terrain"] = place_polygons(drawn, scheme, map_crs, grid)
+        layers = {role: source.layer for role, source in sources.items()}
         with write_atomic_directory(out_path) as half:
-            grids = {role: bands[0].grid for role, bands in sources.items() if layers[role].bands}
-            writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=layers, band_grids=grids)
-            for bands in sources.values():
-                for number, band in enumerate(bands):
-                    _write(writer, band, number)
-            every = {role: min(bands, key=lambda band: band.tally.pixels) for role, bands in sources.items()}
-            _refuse_empty(every)  # of several bands that with the least data counts
-            facts = _make_facts(grid, every, origin, inputs or MapInputs())
-            writer.finish(facts, {role: _set_ranges(bands) for role, bands in sources.items()})
+            writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=layers)
+            for source in sources.values():
+                _write(writer, source)
+            _refuse_empty(sources)
+            facts = _make_facts(grid, sources, origin, inputs or MapInputs())
+            writer.finish(facts, {role: _set_range(source) for role, source in sources.items()})
             write_checksums(half)
     return facts
 
 
-def _make_sources(
-    raster: Raster, schemes: Mapping[str, ClassScheme], grid: MapGrid, crs: CRS, name: str
-) -> Sequence[RasterLayer]:
-    """Return a raster as a layer, or each of its bands, on a grid of their own; log how large that becomes."""
-    layer, count = _make_layer(raster, schemes), len(raster.tiles[0].bands)
-    projection = find_projection(raster.georeference, crs)
-    if raster.role in PAPER_LAYERS or count == 1:
-        tally = Tally(nodata=raster.tiles[0].nodata)
-        return (RasterLayer(layer, raster, grid, projection, schemes.get(raster.role), tally),)
-    grid = choose_layer_grid(grid, raster.georeference, crs)
-    dtype = np.dtype("float16" if all(tile.is_half for tile in raster.tiles) else "float32")
-    values = count * grid.rows * grid.cols
-    message = "map %s: layer %s: %d bands, %d x %d px of %g m, %s: up to %.1f MB"
-    sizes = (count, grid.cols, grid.rows, grid.pixel_size_m, dtype, values * dtype.itemsize / 1e6)
-    logger.info(message, name, layer.name, *sizes)
-    if values > MAX_PIXELS:
-        raise MapError(
-            f"{raster.georeference.name}: {count} bands of {grid.cols} x {grid.rows} px, at most {MAX_PIXELS:.2g} in all"
-        )
-    layer = make_banded_layer(layer.name, layer.unit, [(0.0, 1.0)] * count, dtype.name, grid.pixel_size_m)
-    return [RasterLayer(layer, raster.select_band(band), grid, projection, None) for band in range(count)]
+def _make_source(raster: Raster, schemes: Mapping[str, ClassScheme], grid: MapGrid, crs: CRS) -> RasterLayer:
+    """Return a raster as a layer."""
+    projection, tally = find_projection(raster.georeference, crs), Tally(nodata=raster.tiles[0].nodata)
+    return RasterLayer(_make_layer(raster, schemes), raster, grid, projection, schemes.get(raster.role), tally)
 
 
 def _make_layer(raster: Raster, schemes: Mapping[str, ClassScheme]) -> Layer:
@@ -169,20 +145,17 @@ def _make_layer(raster: Raster, schemes: Mapping[str, ClassScheme]) -> Layer:
     return make_continuous_layer(raster.role, unit=raster.unit, low=0.0, high=1.0)
 
 
-def _set_ranges(bands: Sequence[LayerSource]) -> Layer:
-    """Return a layer with the range of each of its bands, as it was found."""
-    layer, ranges = bands[0].layer, tuple((band.tally.low, band.tally.high) for band in bands)
-    if layer.stack not in {"floats", "bands"}:
-        return layer
-    low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
-    return replace(layer, low=low, high=high, bands=ranges if layer.bands else ())
+def _set_range(source: LayerSource) -> Layer:
+    """Return a layer with the range of its values, as it was found."""
+    layer, tally = source.layer, source.tally
+    return replace(layer, low=tally.low, high=tally.high) if layer.stack == "floats" else layer
 
 
-def _write(writer: MapWriter, source: LayerSource, band: int) -> None:
+def _write(writer: MapWriter, source: LayerSource) -> None:
     for row0, col0, rows, cols in iterate_shards(source.grid, SHARD_PX):
         shard = source.shard(row0, col0, rows, cols)
         if source.tally.count(source.layer, source.label, shard):
-            writer.write(source.layer.name, row0, col0, shard, band)
+            writer.write(source.layer.name, row0, col0, shard)
 
 
 def _read_own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[str, ClassScheme]:

@@ -38,7 +38,7 @@ from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.maps.map_facts import read_value_names
 from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.terrain.layers import LUMA_RGB, MAX_BANDS
+from tcpipe.terrain.layers import LUMA_RGB
 from tcpipe.terrain.target_grid import MapGrid
 
 Use = Literal["metres", "grey", "red", "green", "blue", "classes", "numbers"]
@@ -136,8 +136,6 @@ class Tile:
     """Scale and offset to metres, to grey from 0 to 255, or to the numbers that are meant."""
     unit: str
     """Unit of numbers by the file; empty if the file states no unit."""
-    is_half: bool
-    """Whether float16 keeps the numbers: they are of 16 bits, or whole ones of 8 bits."""
     opaque: NDArray[np.bool_] | None
     """Which indices of a palette can be seen."""
 
@@ -168,11 +166,7 @@ def read_window(  # noqa: PLR0917
     dataset = open_file(tile.path, tile.driver)
     try:
         raw = dataset.read(tile.bands, window=window)
-        mask = (
-            dataset.read_masks(tile.bands[0], window=window)
-            if tile.use == "numbers"
-            else dataset.dataset_mask(window=window)
-        )
+        mask = dataset.dataset_mask(window=window)
     except RasterioError as error:
         raise MapError(
             f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: "
@@ -242,7 +236,6 @@ def read_tile(path: Path, role: str, use: Use) -> Tile:
                 bands=bands,
                 scale=scale,
                 unit=unit,
-                is_half=use == "numbers" and _fits_half(dataset, bands, scale),
                 opaque=np.isfinite(_read_palette_grey(dataset.colormap(bands[0]))) if palette else None,
             )
 
@@ -396,10 +389,8 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
             return tuple(plain), (make_finding("ortho-colours-assumed", subject, names=file),)
         wanted = "grey or red, green, blue" if use == "grey" else "red, green, blue for --ortho-bands rgb"
         raise MapError(f"{path}: ortho has {dataset.count} bands ({names}), expected {wanted}, and alpha at most")
-    most = MAX_BANDS if use == "numbers" else 1
-    if not 1 <= len(plain) <= most or len(kinds) > 1:
-        wanted = "one" if most == 1 else f"1 to {most} of one type"
-        problem = f"{path}: {role} has {dataset.count} bands ({names[:80]}), expected {wanted}"
+    if len(plain) != 1:
+        problem = f"{path}: {role} has {dataset.count} bands ({names[:80]}), expected one"
         has_colours = use == "classes" and len(plain) == 3 and kinds == {np.dtype(np.uint8)}
         raise MapError(problem + " of class values; convert each colour to a value (rio calc)" * has_colours)
     kind = kinds.pop()
@@ -414,22 +405,12 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
     return tuple(plain), ()
 
 
-def _fits_half(dataset: Any, bands: tuple[int, ...], scale: tuple[float, float]) -> bool:
-    """Return whether float16 keeps all numbers of these bands."""
-    if np.dtype(dataset.dtypes[bands[0] - 1]).itemsize == 1:
-        return 255.0 * abs(scale[0]) + abs(scale[1]) < float(np.finfo(np.float16).max)
-    stored = {dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS") for band in bands}
-    return dataset.dtypes[bands[0] - 1] == "float16" or (stored == {"16"} and scale == (1.0, 0.0))
-
-
 def _read_scaling(
     dataset: Any, path: Path, role: str, use: Use, bands: tuple[int, ...]
 ) -> tuple[tuple[float, float], tuple[Finding, ...]]:
     """Return scale and offset to metres, numbers or grey; for grey and classes, a finding that such tags were not applied."""
     scale, offset = dataset.scales[bands[0] - 1], dataset.offsets[bands[0] - 1]
     if use == "numbers":
-        if len({(dataset.scales[band - 1], dataset.offsets[band - 1], dataset.units[band - 1]) for band in bands}) > 1:
-            raise MapError(f"{path}: bands of {role} differ in scale, offset or unit; write them as one kind of number")
         return (scale, offset), ()
     if use != "metres":
         size = np.dtype(dataset.dtypes[bands[0] - 1]).itemsize

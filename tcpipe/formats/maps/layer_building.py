@@ -55,10 +55,6 @@ class Raster:
     """First row, last row (not included), first column, last column of each tile, shape (T, 4)."""
     open_file: OpenFile = field(repr=False)
 
-    def select_band(self, number: int) -> Raster:
-        """Return one band, by its number from 0."""
-        return replace(self, tiles=tuple(replace(tile, bands=(tile.bands[number],)) for tile in self.tiles))
-
     @property
     def name(self) -> str:
         """Its name without the folder."""
@@ -292,7 +288,7 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class RasterLayer:
-    """A raster, or one band of it, as a layer; ``projection`` is from its CRS to the grid's, None where they are the same."""
+    """A raster as a layer; ``projection`` is from its CRS to the grid's, None where they are the same."""
 
     layer: Layer
     raster: Raster

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Literal, TypeAlias
 from xml.etree.ElementTree import Element, fromstring
 
 from tcpipe.formats.json_files import parse_typed
-from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.findings import LEFT_OUT, Finding
 from tcpipe.terrain.layers import (
     PAPER_LAYERS,
@@ -17,7 +16,6 @@ from tcpipe.terrain.layers import (
     Kind,
     Layer,
     TerrainClass,
-    make_banded_layer,
     make_categorical_layer,
     make_continuous_layer,
     make_paper_layers,
@@ -95,8 +93,7 @@ def _format_detail(layer: str, summary: MapSummary) -> str:
         return f": {summary.height_min_m:.1f} to {summary.height_max_m:.1f} m"
     own = read_layers(summary.described, (), Path(summary.name)).get(layer)
     if own is not None and own.kind == "continuous" and own.stack != "greys":
-        bands = f" {len(own.bands)} bands of {own.pixel_size_m:g} m ({own.mapped})," if own.bands else ""
-        return f":{bands} {own.low:.6g} to {own.high:.6g}" + ("" if own.unit == "1" else f" {own.unit}")
+        return f": {own.low:.6g} to {own.high:.6g}" + ("" if own.unit == "1" else f" {own.unit}")
     if layer == "terrain" or own is not None:
         classes = summary.class_share if layer == "terrain" else summary.class_shares[layer]
         shares = sorted(classes.items(), key=lambda entry: (-entry[1], entry[0]))
@@ -177,10 +174,6 @@ class _LayerDescription:
     actual_range: tuple[float, float] = (0.0, 1.0)
     classes: tuple[TerrainClass, ...] = ()
     dtype: Literal["uint8", "uint16", "float16", "float32"] = "float32"
-    bands: tuple[tuple[float, float], ...] = ()
-    """Range of each band of a layer of several bands; so are the next two."""
-    pixel_size_m: Annotated[float, Bounds(gt=0)] = 1.0
-    own_px: Annotated[int, Bounds(ge=0, le=1024)] = 0
 
 
 def make_cf_flags(classes: ClassTable | None) -> dict[str, Value]:
@@ -195,7 +188,7 @@ def make_cf_attributes(layer: Layer) -> dict[str, Value]:
     about: dict[str, Value] = {"long_name": layer.long_name, "units": layer.unit}
     if layer.kind == "categorical":
         return {**about, **make_cf_flags(layer.classes)}
-    if layer.stack in {"floats", "bands"}:
+    if layer.stack == "floats":
         return {**about, "actual_range": [layer.low, layer.high]}
     about |= {"scale_factor": layer.step, "add_offset": 0.0}
     return {**about, "missing_value": layer.nodata} if layer.kind == "relative" else about
@@ -206,9 +199,6 @@ def describe_layer(layer: Layer) -> Description:
     known = {"dtype": layer.stored.name, "nodata": layer.nodata, **make_cf_attributes(layer)}
     if layer.name in PAPER_LAYERS:
         return known
-    if layer.bands:
-        known |= {"bands": [list(band) for band in layer.bands], "pixel_size_m": layer.pixel_size_m}
-        known |= {"own_px": layer.own_px} if layer.own_px else {}
     table = () if layer.classes is None else layer.classes.classes
     return {**known, "kind": layer.kind, **({"classes": [asdict(entry) for entry in table]} if table else {})}
 
@@ -223,9 +213,6 @@ def read_layers(found: Mapping[str, Description], classes: Sequence[TerrainClass
             layers[name] = replace(known[name], long_name=about.long_name or known[name].long_name)
         elif about.kind == "categorical":
             layers[name] = make_categorical_layer(name, ClassTable(about.classes))
-        elif about.bands:
-            own = about.bands, about.dtype, about.pixel_size_m, about.own_px
-            layers[name] = make_banded_layer(name, about.units, *own)
         else:
             low, high = about.actual_range
             layers[name] = make_continuous_layer(name, unit=about.units, low=low, high=high)

@@ -9,7 +9,6 @@ terrain      uint8    class ids of the class table; 0: no data
 ortho_red …  uint8    red, green and blue of an orthophoto kept in colour, as ortho
 any other    float32  a user's continuous layer, in its own unit; NaN: no data
 any other    uint8    a user's categorical layer: class ids of its own table; 0: no data
-bands/NAME   float    a user's layer of several bands, a group: (band, y, x) on a grid of its own, x and y; NaN: no data
 x, y         float64  pixel centres in the map's CRS [m]
 spatial_ref  int64    CF grid mapping: the CRS as WKT, and GDAL's GeoTransform
 ===========  =======  ==========================================================================
@@ -25,9 +24,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -53,13 +50,10 @@ from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.layers import PAPER_LAYERS, ClassScheme, ClassTable, Layer, Pixels, TerrainClass, find_no_data_value
 from tcpipe.terrain.resampling import iterate_levels, list_factors, make_overview_grid
 from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX, MapGrid
-from tcpipe.terrain.tiles import BandReader, MapReader
+from tcpipe.terrain.tiles import MapReader
 
 TILE_PX = 512
 """Side of a tile: the unit that is decoded."""
-
-BANDS = "bands"
-"""Group of the layers of several bands."""
 
 SHARD_PX = 2048
 """Side of a shard: the unit that is a file, and that is written at once."""
@@ -76,8 +70,6 @@ class _Attributes:
     id_by_value: Mapping[int, int]
     layers: tuple[str, ...]
     described: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
-    band_grids: Mapping[str, MapGrid] = field(default_factory=dict, metadata=LEFT_OUT)
-    """Grids of layers of several bands."""
     factors: tuple[int, ...]
     tile_px: int
     height_reference_m: float
@@ -100,11 +92,6 @@ class MapFile(MapReader):
         """Return the map at one of its ``factors``, which are the full map's."""
         return replace(self, grid=make_overview_grid(self.grid, factor), factors=(1,), _factor=factor)
 
-    @property
-    def all_layers(self) -> dict[str, Layer]:
-        """All layers, those of several bands last."""
-        return {**self.layers, **{name: bands.layer for name, bands in self.banded.items()}}
-
     def summary(self) -> MapSummary:
         """Return what the map is as a whole."""
         grid = self.grid
@@ -117,10 +104,10 @@ class MapFile(MapReader):
             cols=grid.cols,
             pixel_size_m=grid.pixel_size_m,
             bounds_m=grid.bounds_m,
-            layers=tuple(self.all_layers),
+            layers=tuple(self.layers),
             overviews=self.factors[1:],
             class_table=self.classes.classes,
-            described=_describe_layers(self.all_layers),
+            described=_describe_layers(self.layers),
         )
 
     def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
@@ -153,14 +140,6 @@ def _name_damage(what: str) -> Iterator[None]:
         raise MapError(f"{what} cannot be read ({error}); add the map again") from error
 
 
-def _read_bands(  # noqa: PLR0917
-    what: str, array: ShardedArray, row0: int, row1: int, col0: int, col1: int
-) -> NDArray[Any]:
-    """Return a window of all bands, shape (bands, rows, columns); `MapError`: a tile is damaged."""
-    with _name_damage(what):
-        return np.stack([array.window(row0, row1, col0, col1, lead=(band,)) for band in range(array.shape[0])])
-
-
 def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool = True) -> MapFile:
     """Open a map for reading; its shards are in the folders of their descriptions, or are ``fetched``.
 
@@ -180,7 +159,7 @@ def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool =
         )
     try:
         kept = parse_typed(found, _Attributes, path)
-        described = {name: kept.described.get(name, {}) for name in (*kept.layers, *kept.band_grids)}
+        described = {name: kept.described.get(name, {}) for name in kept.layers}
         every = read_layers(described, kept.class_table, path)
         layers = {name: every[name] for name in kept.layers}
         _refuse_sizes(kept, path)
@@ -193,32 +172,26 @@ def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool =
             }
             for factor in kept.factors
         }
-        banded = {}
-        for name, grid in kept.band_grids.items():
-            array = _open_array(path / BANDS / name, every[name], grid, 1, fetched)
-            read = partial(_read_bands, f"map {kept.name}: {name}", array)
-            banded[name] = BandReader(every[name], grid, TILE_PX, read)
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
     classes = ClassTable(kept.class_table)
-    return convert_record(kept, MapFile, classes=classes, layers=layers, _levels=levels, banded=banded)
+    return convert_record(kept, MapFile, classes=classes, layers=layers, _levels=levels)
 
 
 def _refuse_sizes(kept: _Attributes, path: Path) -> None:
     """Raise `StoreError` where a map says that it is larger than any, or cut otherwise than every map is."""
-    for grid in (kept.grid, *kept.band_grids.values()):
-        rows, cols, pixel_size_m = grid.rows, grid.cols, grid.pixel_size_m
-        if not (0 < rows <= MAX_SIDE_PX and 0 < cols <= MAX_SIDE_PX and rows * cols <= MAX_PIXELS and pixel_size_m > 0):
-            raise StoreError(
-                f"{path}: says that it has {rows} x {cols} pixels of {pixel_size_m} m, at most {MAX_SIDE_PX} a side"
-            )
+    rows, cols, pixel_size_m = kept.grid.rows, kept.grid.cols, kept.grid.pixel_size_m
+    if not (0 < rows <= MAX_SIDE_PX and 0 < cols <= MAX_SIDE_PX and rows * cols <= MAX_PIXELS and pixel_size_m > 0):
+        raise StoreError(
+            f"{path}: says that it has {rows} x {cols} pixels of {pixel_size_m} m, at most {MAX_SIDE_PX} a side"
+        )
     wanted = (TILE_PX, list_factors(kept.grid))
     if (kept.tile_px, kept.factors) != wanted:
         raise StoreError(f"{path}: tiles and overviews are {(kept.tile_px, kept.factors)}, expected {wanted}")
 
 
 def _open_array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: FetchedShards | None) -> ShardedArray:
-    shape, chunk_shape, shard_shape = _shape_array(layer, whole, factor)
+    shape, chunk_shape, shard_shape = _shape_array(whole, factor)
     fill = find_no_data_value(layer.mapped)
     return open_sharded(
         path / layer.name,
@@ -235,11 +208,10 @@ def _open_array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: 
 Shape = tuple[int, ...]
 
 
-def _shape_array(layer: Layer, whole: MapGrid, factor: int) -> tuple[Shape, Shape, Shape]:
+def _shape_array(whole: MapGrid, factor: int) -> tuple[Shape, Shape, Shape]:
     """Return the shapes of a layer's array at a level, of its tiles and of its shards."""
     grid, shard_px = make_overview_grid(whole, factor), max(SHARD_PX // factor, TILE_PX)
-    bands, one = ((len(layer.bands),), (1,)) if layer.bands else ((), ())
-    return (*bands, grid.rows, grid.cols), (*one, TILE_PX, TILE_PX), (*one, shard_px, shard_px)
+    return (grid.rows, grid.cols), (TILE_PX, TILE_PX), (shard_px, shard_px)
 
 
 def _prove(path: Path, fetched: FetchedShards | None) -> None:
@@ -275,32 +247,23 @@ class MapWriter:
         grid: MapGrid,
         scheme: ClassScheme,
         layers: Mapping[str, Layer],
-        band_grids: Mapping[str, MapGrid] = MappingProxyType({}),
     ) -> None:
         self._name, self._grid, self._scheme, self._layers = name, grid, scheme, layers
-        self._band_grids, self._factors = band_grids, list_factors(grid)
+        self._factors = list_factors(grid)
         self._group = create_group(directory)
-        plain = [layer for name, layer in layers.items() if name not in band_grids]
         self._levels: dict[int, dict[str, Any]] = {}
         for factor in self._factors:
             group = self._group if factor == 1 else self._group.create_group(_level_path(factor).rstrip("/"))
-            self._levels[factor] = {layer.name: _add_layer(group, layer, grid, factor) for layer in plain}
-        for layer_name, own in band_grids.items():
-            group = self._group.create_group(f"{BANDS}/{layer_name}")
-            _place(group, own, f"{name}, {layer_name}")
-            self._levels[1][layer_name] = _add_layer(group, layers[layer_name], own, 1)
+            self._levels[factor] = {layer.name: _add_layer(group, layer, grid, factor) for layer in layers.values()}
         self.height_reference_m: float | None = None
         """Reference of stored heights [m]: the floor of the smallest height of the first shard with heights."""
 
-    def write(self, layer: str, row0: int, col0: int, values: Pixels, band: int = 0) -> None:
-        """Write a shard of a layer or band; its corner is at a multiple of `SHARD_PX`, no data are NaN in floats and 0 in bytes."""
+    def write(self, layer: str, row0: int, col0: int, values: Pixels) -> None:
+        """Write a shard of a layer; its corner is at a multiple of `SHARD_PX`, no data are NaN in floats and 0 in bytes."""
         if self._layers[layer].kind == "relative":
             if self.height_reference_m is None and np.isfinite(values).any():
                 self.height_reference_m = float(np.floor(np.nanmin(values)))
             values = values - (self.height_reference_m or 0.0)
-        if layer in self._band_grids:
-            _put(self._levels[1][layer], row0, col0, values, band)
-            return
         _put(self._levels[1][layer], row0, col0, values)
         for factor, level in iterate_levels(self._layers[layer], values, self._factors):
             _put(self._levels[factor][layer], row0 // factor, col0 // factor, level)
@@ -319,9 +282,8 @@ class MapWriter:
             grid=self._grid,
             class_table=self._scheme.table.classes,
             id_by_value=self._scheme.id_by_value,
-            layers=tuple(name for name in layers if name not in self._band_grids),
+            layers=tuple(layers),
             described=_describe_layers(layers),
-            band_grids=self._band_grids,
             factors=self._factors,
             tile_px=TILE_PX,
             height_reference_m=reference_m,
@@ -331,10 +293,10 @@ class MapWriter:
         consolidate_metadata(self._group)
 
 
-def _put(array: Any, row0: int, col0: int, values: Pixels, *band: int) -> None:
+def _put(array: Any, row0: int, col0: int, values: Pixels) -> None:
     if values.size:
         rows, cols = values.shape
-        array[*band, row0 : row0 + rows, col0 : col0 + cols] = values.astype(array.dtype)
+        array[row0 : row0 + rows, col0 : col0 + cols] = values.astype(array.dtype)
 
 
 def _place(group: Any, grid: MapGrid, title: str) -> None:
@@ -382,9 +344,9 @@ def _add_layer(group: Any, layer: Layer, whole: MapGrid, factor: int) -> Any:
         attributes |= {**make_cf_flags(layer.classes), "_FillValue": 0}
     else:
         attributes |= {"units": layer.unit}
-        attributes |= {} if layer.bands else {"scale_factor": layer.step if layer.stack == "greys" else 1.0}
+        attributes |= {"scale_factor": layer.step if layer.stack == "greys" else 1.0}
         attributes |= {"_FillValue": 0} if layer.stack == "greys" else {}
-    shape, chunks, shards = _shape_array(layer, whole, factor)
+    shape, chunks, shards = _shape_array(whole, factor)
     return add_array(
         group,
         layer.name,
@@ -392,7 +354,7 @@ def _add_layer(group: Any, layer: Layer, whole: MapGrid, factor: int) -> Any:
         dtype=layer.mapped,
         chunks=chunks,
         shards=shards,
-        dimensions=("band", "y", "x")[-len(shape) :],
+        dimensions=("y", "x"),
         fill_value=find_no_data_value(layer.mapped),
         attributes={**attributes, "grid_mapping": "spatial_ref"},
     )

@@ -155,15 +155,13 @@ def _describe_tensor(layers: Mapping[str, Layer], classes: ClassTable) -> dict[s
 
 def _describe_formula(layer: Layer) -> str:
     """Return the formula of a layer other than the paper's in the tensor."""
-    if layer.bands:
-        return "(X - low) / (high - low) of each band"
     if layer.kind == "categorical":
         return f"(C - 1) / ({layer.high:g} - 1)"
     return "O / 255" if layer.stack == "greys" else f"(X - {layer.low!r}) / ({layer.high!r} - {layer.low!r})"
 
 
 def _map_source(source: MapFile, sha256: str, registration: tuple[MapRegistration, ...]) -> MapSource:
-    named = {"name": source.name, "layers": tuple(source.all_layers), "sha256": sha256, "registration": registration}
+    named = {"name": source.name, "layers": tuple(source.layers), "sha256": sha256, "registration": registration}
     return convert_record(source.facts, MapSource, **named, **asdict(source.grid))
 
 

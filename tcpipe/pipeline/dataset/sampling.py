@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -30,12 +29,12 @@ from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.layers import Layer, join_layers, sort_layers
 from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.sampling_kernel import compute_morton
-from tcpipe.terrain.tiles import TilePool, choose_level, list_layers
+from tcpipe.terrain.tiles import TilePool, choose_level
 
 logger = logging.getLogger("tcpipe")
 
 _BATCH_ROWS, _BATCH_BYTES = 8_192, 200_000_000
-"""Segments sampled together: 50 MB of patches, unless a layer has many bands."""
+"""Segments sampled together: 50 MB of patches."""
 
 _ROW_BITS = 32
 _ROW_MASK = (1 << _ROW_BITS) - 1
@@ -77,7 +76,7 @@ class Spool:
     def read(self, layer: str, slots: NDArray[np.int64]) -> LayerPixels:
         """Return the patches in ``slots``, shape (n, *patch); one span is read of each batch."""
         kind, each = self.layers[layer], self._patch_bytes(layer)
-        dtype, shape = kind.stored, kind.patch_shape(self.patch_px)
+        dtype, shape = kind.stored, (self.patch_px, self.patch_px)
         patches = np.empty((len(slots), *shape), dtype)
         before = sum(self._patch_bytes(name) for name in itertools.takewhile(lambda name: name != layer, self.layers))
         order = np.argsort(slots, kind="stable")
@@ -97,7 +96,7 @@ class Spool:
         return sum(map(self._patch_bytes, self.layers))
 
     def _patch_bytes(self, layer: str) -> int:
-        return math.prod(self.layers[layer].patch_shape(self.patch_px)) * self.layers[layer].stored.itemsize
+        return self.patch_px**2 * self.layers[layer].stored.itemsize
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,18 +134,11 @@ def sample_all_segments(
     The results are arrays in files in ``directory``, pixels in files below it. `TcpipeError` if the map or the segments cannot be used.
     """
     sources = [open_map(*arguments) for arguments in maps()]
-    check_same_layers(sources, config)
-    found = [list_layers(source, config.patch_m, config.patch_px) for source in sources]
-    layers = sort_layers(join_layers(found))
+    check_same_layers(sources)
+    layers = sort_layers(join_layers([source.layers for source in sources]))
     (directory / "pixels").mkdir()
     spool = Spool(directory / "pixels", layers, config.patch_px)
     each = spool.sample_bytes
-    if len(layers) > len(sources[0].layers):
-        shapes = (
-            f"{name} {' x '.join(map(str, layer.patch_shape(0)))}" for name, layer in layers.items() if layer.bands
-        )
-        message = "patches: %d segments of %.1f kB (%s) take up to %.1f MB before compression"
-        logger.info(message, segments.num_rows, each / 1e3, ", ".join(shapes), segments.num_rows * each / 1e6)
     rows = list(_iterate_batches(segments, max(min(_BATCH_ROWS, _BATCH_BYTES // each), 1)))
     placed = segments.select(PLACED_SEGMENTS.names())
     batches = (  # made when a worker can have them: one copy of their segments exists at a time
