@@ -1,4 +1,4 @@
-"""Write docs/images/ from the demo: a tour of its pages in Chromium, and a plan (`make pictures`)."""
+"""Write docs/images/ from the demo: one metre, a plan, and a tour of its pages in Chromium (`make pictures`)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from metre import draw_metre
 from PIL import Image
 from playwright.sync_api import sync_playwright
 from tour import SCREEN_PX, record_tour
@@ -24,6 +25,7 @@ def main() -> None:
     here.mkdir()
     try:
         run(here, "demo", "demo", "--quiet")
+        draw_metre(here / "demo", IMAGES / "metre.png")
         run(here, "train", "demo/dataset", "model", "--model", "physics")
         ends = ("--from", _START, "--to", _GOAL, "--store", "demo/store", "--allow-extrapolation")
         run(here, "plan-path", "model", *ends, "--picture", "plan.png")

@@ -8,7 +8,8 @@ import pytest
 from installed_command import run_script
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGES = (*(f"tutorials/{page.name}" for page in sorted((DOCS / "tutorials").glob("*.md"))), "how-to/damaged-logs.md")
+TUTORIALS = sorted(f"tutorials/{page.name}" for page in (DOCS / "tutorials").glob("*.md"))
+PAGES = (*TUTORIALS, "how-to/damaged-logs.md", "how-to/questions.md")
 
 
 def _masked(text: str) -> list[str]:
