@@ -169,9 +169,7 @@ CASES = (
     ),
     Case(
         "plan-path",
-        command(
-            "plan-path", MODEL, "--from", FROM, "--to", TO, "--cell-size", "2", "--picture", "plan.png", *STORE, "-q"
-        ),
+        command("plan-path", MODEL, "--from", FROM, "--to", TO, "--cell-size", "2", *STORE, "-q"),
         before=(_have_store,),
         wants=_MODEL,
     ),

@@ -1,7 +1,7 @@
 """Kinds of model on few samples: RMSE of E and T on drives that were neither fitted nor used to choose.
 
     python benchmarks/few_samples.py DATASET [--make] [--drives 32] [--metres 250] [--site-seed 11]
-                                     [--counts 150 2000 5000] [--kinds auto mean linear …] [--seeds 1]
+                                     [--counts 150 2000 5000] [--kinds auto linear …] [--seeds 1]
 
 With --make DATASET is made first, in its folder: drives over the small site of `tcpipe demo`, of which whole ones are held out; settings
 of kinds were chosen on other sites. A subset is the first so many training samples of a drawn order, another one for each seed; every
@@ -24,7 +24,7 @@ from tcpipe.dataset import Dataset, open_dataset
 from tcpipe.errors import TcpipeError
 from tcpipe.learning.fitting import FitConfig, ModelKind
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, compute_costs
-from tcpipe.learning.predictor import KINDS, Job, Samples, find_kind, predict_samples
+from tcpipe.learning.predictor import AUTOMATIC, Job, Samples, find_kind, predict_samples
 from tcpipe.learning.training import choose_kind, make_samples, select_train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--metres", type=float, default=250.0)
     parser.add_argument("--site-seed", type=int, default=11)
     parser.add_argument("--counts", type=int, nargs="*", default=[150, 2000, 5000])
-    parser.add_argument("--kinds", nargs="*", default=["auto", *KINDS])
+    parser.add_argument("--kinds", nargs="*", default=["auto", *AUTOMATIC, "resnet18"])
     parser.add_argument("--seeds", type=int, default=1)
     told = parser.parse_args()
     if told.make:

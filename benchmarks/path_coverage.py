@@ -6,13 +6,14 @@ Drives wander over the small site of `tcpipe demo` with the paper's robot. All o
 built into a dataset, a model is trained on the first drives; the further ones, in a store of their own, are predicted on the map as
 `tcpipe evaluate --drive` does; all of it for --models seeds. Paths follow one another along a drive. Coverage is of the measured labels,
 over all drives, with its 95 % interval (binomial, clustered by drive: `tcpipe.cost.coverage`); 90 is to be inside. With --payload the
-further drives carry so many kg more. The line of budgets is of paths there and back: two consecutive parts of a drive. The second table
+further drives carry so many kg more. The line of budgets is of two consecutive paths of a drive together. The second table
 predicts the rest of each further drive of the last seed after its first metres adapt the model.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -20,9 +21,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tcpipe.cost.adaptation import Metres, Run, compare_adaptations, predict
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from adapted_drives import compare_adaptations
+
+from tcpipe.cost.adaptation import Metres, Run, predict
 from tcpipe.cost.coverage import measure_coverage
-from tcpipe.cost.prediction_errors import COVERAGE, Errors
+from tcpipe.cost.prediction_errors import COVERAGE, NORMAL_HALF_WIDTH, Errors
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.training import train
@@ -90,14 +94,15 @@ def list_paths(found: Found, quantity: str, length: int) -> Iterator[tuple[str, 
 
 
 def format_coverage(quantity: str, length: int, found: Found) -> str:
-    """Return how many paths of a length are inside their interval, and how wide that is."""
-    inside, names, widths = [], [], []
+    """Return how many paths of a length are inside their interval, how wide that is, and the rms of errors over their σ."""
+    inside, names, widths, scores = [], [], [], []
     for name, errors, path in list_paths(found, quantity, length):
         said = predict(errors, path)
         low, high = (float(said.low[0]), float(said.high[0])) if length == 1 else said.total.interval
         inside.append(low <= float(path.measured.sum()) <= high)
         names.append(name)
         widths.append((high - low) / 2.0 / float(np.abs(path.predicted).sum()))
+        scores.append(float((path.measured - path.predicted).sum()) * 2.0 * NORMAL_HALF_WIDTH / (high - low))
     if not inside:
         return f"{quantity:8} {length:4d} m: no drive is as long"
     share = measure_coverage(np.array(inside), np.array(names))
@@ -105,11 +110,12 @@ def format_coverage(quantity: str, length: int, found: Found) -> str:
     if share.low is not None:
         verdict = "90 is inside" if share.low <= COVERAGE <= (share.high or 0.0) else "90 is NOT inside"
     width = 100.0 * float(np.median(widths))
-    return f"{quantity:8} {length:4d} m: {share} of {share.samples}: {verdict}; ± {width:.1f} %"
+    rms = float(np.sqrt(np.mean(np.square(scores))))
+    return f"{quantity:8} {length:4d} m: {share} of {share.samples}: {verdict}; ± {width:.1f} %, rms z {rms:.2f}"
 
 
 def format_budget(found: Found, length: int = 30) -> str:
-    """Return for how many ways there and back of a drive a budget suffices that `plan-path --budget --return` calls enough at 95 %."""
+    """Return for how many pairs of paths of a drive a budget suffices that `plan-path --budget` calls enough at 95 % for both together."""
     is_enough, names = [], []
     for name, errors, path in list_paths(found, "energy", 2 * length):
         at = np.arange(2 * length)

@@ -43,7 +43,7 @@ from tcpipe.planning.cost_grid import (
     make_grid,
     make_survey,
 )
-from tcpipe.planning.plan import OBJECTIVES, plan_paths
+from tcpipe.planning.plan import OBJECTIVES, plan_path
 from tcpipe.planning.search import find_best_potential, find_least_cost_paths, find_turning, make_steps
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.target_grid import MapGrid
@@ -158,9 +158,9 @@ def plan(cells: int, pairs: int) -> tuple[list[dict[str, float]], tuple[float, f
     for pair in range(pairs):
         ends = [(end % cells + 0.5, cells - end // cells - 0.5) for end in choose_ends(class_id, pair)]
         begun = time.perf_counter(), time.process_time()
-        plans = plan_paths(survey, *lonlat(survey.source, *ends), ("energy",))
+        plans = {"energy": plan_path(survey, *lonlat(survey.source, *ends), "energy")}
         spent = time.perf_counter() - begun[0], time.process_time() - begun[1]
-        plans |= plan_paths(survey, *lonlat(survey.source, *ends), OBJECTIVES[1:])
+        plans |= {name: plan_path(survey, *lonlat(survey.source, *ends), name) for name in OBJECTIVES[1:]}
         judged.append({name: of.totals.energy_joule for name, of in plans.items()})
     return judged, spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 

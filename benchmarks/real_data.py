@@ -22,6 +22,7 @@ predicts a run's, beside the mean of all other runs.
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
@@ -32,8 +33,11 @@ import lightgbm
 import numpy as np
 from numpy.typing import NDArray
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from adapted_drives import compare_adaptations
+
 from tcpipe import ingest
-from tcpipe.cost.adaptation import Metres, Run, compare_adaptations
+from tcpipe.cost.adaptation import Metres, Run
 from tcpipe.cost.physics import ALL, FitSamples, fit_physics
 from tcpipe.cost.prediction_errors import Errors as PredictionErrors
 from tcpipe.cost.prediction_errors import fit_bias_correction, fit_errors

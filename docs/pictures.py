@@ -8,13 +8,20 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
 from metre import draw_metre
 from PIL import Image
+from plan_picture import draw_plans
 from playwright.sync_api import sync_playwright
 from tour import SCREEN_PX, record_tour
 
+from tcpipe.learning.models import load_model
+from tcpipe.planning.cost_grid import make_survey
+from tcpipe.planning.path_files import choose_map
+from tcpipe.planning.plan import OBJECTIVES, plan_path
+
 IMAGES = Path(__file__).parent / "images"
-_START, _GOAL = "17.5993534,47.0000495", "17.6000909,47.0000675"
+_START, _GOAL = np.array([17.5993534, 47.0000495]), np.array([17.6000909, 47.0000675])
 """On both sides of the demo's hill."""
 _PLAN_PX = (1600, 1000)
 
@@ -27,8 +34,10 @@ def main() -> None:
         run(here, "demo", "demo", "--quiet")
         draw_metre(here / "demo", IMAGES / "metre.png")
         run(here, "train", "demo/dataset", "model", "--model", "physics")
-        ends = ("--from", _START, "--to", _GOAL, "--store", "demo/store", "--allow-extrapolation")
-        run(here, "plan-path", "model", *ends, "--picture", "plan.png")
+        model, source = load_model(here / "model"), choose_map(here / "demo/store", None)
+        survey = make_survey(model, source, 1.0)
+        plans = [plan_path(survey, _START, _GOAL, objective, allow_extrapolation=True) for objective in OBJECTIVES]
+        draw_plans(here / "plan.png", source, plans)
         plan = Image.open(here / "plan.png").convert("RGB")
         plan.thumbnail(_PLAN_PX)
         plan.save(IMAGES / "plan.jpg", quality=85)

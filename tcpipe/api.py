@@ -16,7 +16,7 @@ from tcpipe.tables.options import as_function
 if TYPE_CHECKING:
     from tcpipe.learning.evaluation_files import EvaluationResult
     from tcpipe.learning.training import TrainResult
-    from tcpipe.planning.drives import AdaptationResult, DrivesResult
+    from tcpipe.planning.drives import DrivesResult
     from tcpipe.planning.path_files import PathResult, PlanResult
 
 
@@ -34,7 +34,7 @@ def run_train(options: TrainOptions) -> TrainResult:
 
     names = [entry.name for entry in fields(FitConfig) if entry.name != "predictor"]
     given = {name: value for name in names if (value := getattr(options, name, None)) is not None}
-    is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features", "layers"})
+    is_network = bool(given.keys() - {"model", "loss", "label", "extra_features", "layers"})
     if isinstance(layers := given.get("layers"), str):
         given["layers"] = [name.strip() for name in layers.split(",")]
     if options.predictor is not None and options.model is not None:
@@ -48,7 +48,7 @@ def run_train(options: TrainOptions) -> TrainResult:
 train = as_function(TrainOptions, run_train)
 
 
-def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | AdaptationResult:
+def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     """Measure a model on a dataset's test samples and unseen area, or on whole drives, and write the evaluation to ``out``.
 
     ``values`` of the result are those of the written JSON; ``str`` of it is what the command prints. Raises `UsageError` where an option
@@ -59,7 +59,7 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
     if options.drives:
         from tcpipe.dataset import open_dataset
         from tcpipe.learning.models import load_model
-        from tcpipe.planning.drives import check_origin, evaluate_adaptation, evaluate_drives
+        from tcpipe.planning.drives import check_origin, evaluate_drives
         from tcpipe.planning.path_files import choose_map
 
         loaded, source, data = (
@@ -68,17 +68,12 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult | 
             open_dataset(dataset),
         )
         logs = [*map(str, options.drives)]
-        if options.adapt is not None:
-            return evaluate_adaptation(loaded, data, source, logs, options.adapt, store=store, out=Path(out))
         check_origin(loaded, data)
         return evaluate_drives(loaded, data, source, logs, store=store, out=out)
-    from tcpipe.errors import UsageError
     from tcpipe.learning.evaluation import EvaluateConfig
     from tcpipe.learning.evaluation_files import run_evaluation
     from tcpipe.recipe.checking import from_values
 
-    if options.adapt is not None:
-        raise UsageError("--adapt: which runs adapt the model? name them with --drive LOG")
     asked = {name: getattr(options, name) for name in ("noise_draws", "seed")}
     return run_evaluation(
         model, dataset, out, config=from_values(EvaluateConfig, asked, where="evaluate"), predictor=options.predictor
@@ -99,9 +94,7 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     from tcpipe.planning.path_files import predict_path as run
 
     source = choose_map(options.store, options.map_name)
-    asked = choose_model(
-        options.model, physics=options.physics_from, speed_mps=options.speed_mps, predictor=options.predictor
-    )
+    asked = choose_model(options.model, speed_mps=options.speed_mps, predictor=options.predictor)
     known = None
     if options.adapt is not None:
         from tcpipe.planning.drives import collect_runs
@@ -115,17 +108,15 @@ predict_path = as_function(PredictPathOptions, run_predict_path)
 
 
 def run_plan_path(options: PlanPathOptions) -> PlanResult:
-    """Find the path of least energy, time or distance between two points and write it as GeoJSON.
+    """Find the path of least energy, time or distance between two points and write it as GeoJSON and as messages for Nav2.
 
-    The result has the totals of each objective, and ``lonlat_deg``, the points of the path; ``str`` of it is what the command prints.
+    The result has the totals, and ``lonlat_deg``, the points of the path; ``str`` of it is what the command prints.
     Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` where an input cannot be used, or there is no path.
     """
     from tcpipe.learning.models import choose_model
     from tcpipe.planning.path_files import choose_map, plan
 
-    asked = choose_model(
-        options.model, physics=options.physics_from, speed_mps=options.speed_mps, predictor=options.predictor
-    )
+    asked = choose_model(options.model, speed_mps=options.speed_mps, predictor=options.predictor)
     return plan(asked, choose_map(options.store, options.map_name), options)
 
 

@@ -38,7 +38,7 @@ CARD = ModelCard(
         {"slope_rad": (-0.3, 0.3), "cross_slope_rad": (-0.25, 0.25), "relief_m": (0.0, 0.5)},
     ),
     dataset=TrainedOn("made", "0" * 64, "1.0", {"train": 100}),
-    training=Training("key", FitConfig(), "resnet18", "Adam", {"fitted": 80, "held out": 20}, 3, 2, 0.1, "cpu"),
+    training=Training("key", FitConfig(), "resnet18", {"fitted": 80, "held out": 20}, 3, 2, 0.1, "cpu"),
 )
 
 
@@ -66,7 +66,6 @@ def made_model(directory: Path, *, seed: int = 0, rows: int = 60, width: int = 1
     ground = pa.table({"lon_deg": np.empty(0), "lat_deg": np.empty(0)})
     write_model(
         directory, card=card, weights=network.arrays(), residuals=residuals, ground=ground, history="epoch,loss\n",
-        readme="made\n",
     )  # fmt: skip
     return directory
 
@@ -86,6 +85,6 @@ def made_evaluation(**changes) -> Evaluation:
     """An evaluation without any figure; ``changes`` replace its fields."""
     empty = Evaluation(
         tcpipe_version="", key="", model=EvaluatedModel("", "", CARD.training), dataset=EvaluatedDataset("", "", {}),
-        config=EvaluateConfig(), splits={}, ablation=(), time={}, repeatability={},
+        config=EvaluateConfig(), splits={}, ablation=(), time={},
     )  # fmt: skip
     return replace(empty, **changes)

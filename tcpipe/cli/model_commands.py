@@ -53,9 +53,6 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 
     With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals, in drives.json of OUT;
     DATASET, which MODEL was trained on, shows whether a drive was held back.
-
-    With --drive and --adapt: errors and coverage on the rest of each drive after its first metres adapt MODEL, in adaptation.json
-    of OUT; the drives may be of another robot.
     """
     from tcpipe.api import run_evaluate
 
@@ -203,7 +200,8 @@ def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[Model, Ma
 def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
     """Find the path of least energy, time or distance between two points; costs depend on the direction of travel.
 
-    Exit code 3: parts of the path have no cost, because --cell-size is large.
+    Writes GeoJSON to --out, and beside it a nav_msgs/Path (.path.json) and the goal of Nav2's FollowGPSWaypoints (.waypoints.json).
+    Exit code 3: parts of the path have no cost, because --cell-size is large, or the budget is too small.
     """
     from tcpipe.api import run_plan_path
 
@@ -223,15 +221,12 @@ def route_graph(options: RouteGraphOptions, *, as_json: bool, quiet: bool) -> in
     Exit code 3: some edges have no cost; they are left out.
     """
     from tcpipe.planning.route_graph import write_route_graph
-    from tcpipe.store import open_store
 
-    graph = None if options.graph is None else Path(options.graph)
     with show_progress("route-graph", quiet=quiet):
         result = write_route_graph(
             *_load_inputs(options),
             Path(options.out),
-            graph=graph,
-            store=open_store(options.store),
+            graph=Path(options.graph),
             origin_deg=options.origin_deg,
             two_way=options.two_way,
         )

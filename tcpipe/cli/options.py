@@ -203,15 +203,6 @@ def _parse_named_files(option: str, given: tuple[str, ...], hint: str) -> dict[s
     return files
 
 
-def parse_lengths(_: click.Context, __: click.Parameter, value: str | None) -> tuple[float, ...] | None:
-    """Turn ``0,10,50`` into lengths [m]."""
-    if value is None:
-        return None
-    if re.fullmatch(r"\d{1,5}(\.\d{1,3})?(,\d{1,5}(\.\d{1,3})?)*", value) is None:
-        raise click.BadParameter(f"{value!r}: expected metres with commas between, as 0,10,50,100")
-    return tuple(float(part) for part in value.split(","))
-
-
 def parse_holdout(_: click.Context, __: click.Parameter, value: str | None) -> str | None:
     """Return a valid kind of holdout; anything else is a usage error."""
     if value is not None and re.fullmatch(r"block|sample|run|tag:.+", value) is None:
@@ -237,7 +228,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "energy": {"callback": parse_energy},
     "shard": {"callback": parse_shard},
     "holdout": {"callback": parse_holdout},
-    "lengths": {"callback": parse_lengths},
 }
 """Click's settings of a declared option, by its kind."""
 

@@ -1,23 +1,20 @@
-"""Adapt a model to another run, robot, payload or season by the first metres of it.
+"""Adapt a model to another run, robot, payload or season by its first metres.
 
-The trained model is the prior. With p what it predicts of the metres of the new run, and y what was measured there::
+The trained model is the prior. With predictions p and measurements y of the metres of the new run::
 
     y = p + X b + e,   b ~ N(0, s² Q),   e ~ N(0, s² S R S)
 
-The columns of X are the spread of a metre (the error of the run, as large as runs differed in training), p (scale), predicted duration
-(idle power), rise (payload; 10 % count as a metre) and turn (0.3 rad count as a metre), all in the unit of y. S are the spreads that the
-model states of a metre, R the correlation of near metres. How far the robot has changed is not known: Q has the relative variance q² of
-the last four for each q of a grid, and the answers are averaged, each with its evidence (Gelman et al., Bayesian Data Analysis, 2013,
-7.4). A point of the grid is q = 0: nothing has changed. s² has an inverse-gamma prior of mean about 1, so that all that is stated has
-Student's t (ibid., 14.2).
+The columns of X are the spread of a metre (error of a run), p (scale), predicted duration (idle power), rise (payload; 10 % count as a
+metre) and turn (0.3 rad count as a metre), all in the unit of y. S are the stated spreads of a metre, R the correlation of near metres.
+Q has the relative variance q² of the last four for each q of a grid, of which q = 0 means that nothing has changed; the results are
+averaged by their evidence (Gelman et al., Bayesian Data Analysis, 2013, 7.4). s² has an inverse-gamma prior of mean about 1, so that
+predictions have Student's t (ibid., 14.2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from hashlib import sha256
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,20 +32,20 @@ _RISE_M, _TURN_RAD = 0.1, 0.3
 _FREEDOM = 20.0
 """Metres that the prior of s² counts as."""
 _PLACE_SHARE, _PLACE_M = 0.2, 30.0
-"""Share of the variance of errors that metres within about this distance have in common [m], beyond what held-out samples show."""
+"""Share of the variance of errors that metres within a distance have in common [1], and that distance [m]; held-out samples show less."""
 _UPPER_END = (1.0 + COVERAGE) / 2.0
 """Probability below the upper end of an interval."""
 
 
 @dataclass(frozen=True, slots=True)
 class Metres:
-    """N metres of one run in order, shape (N,): one quantity as it was predicted and, where it is known, measured."""
+    """N metres of one run in order, shape (N,): predictions and, if known, measurements of one quantity."""
 
     predicted: Floats
     measured: Floats
     class_id: NDArray[np.integer]
     distance_m: Floats
-    """Where each begins, along the run."""
+    """Distance of its start along the run."""
     length_m: Floats
     duration_s: Floats
     """Predicted."""
@@ -57,25 +54,24 @@ class Metres:
     turn_rad: Floats
     """Over each, both ways counted."""
     stated_std: Floats | None = None
-    """Of the prediction, by the model itself; None: as usual."""
+    """Standard deviation that the model states; None: the usual one."""
     is_near: NDArray[np.bool_] | None = None
     """Whether each is near training ground; None: none is."""
 
     def take(self, rows: NDArray[np.bool_]) -> Metres:
         """Return some of them."""
-        values: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        values = {name: None if value is None else value[rows] for name, value in values.items()}
-        return Metres(**values)
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return replace(self, **{name: value[rows] for name, value in values.items() if value is not None})
 
     @property
     def ground(self) -> tuple[Floats, NDArray[np.integer], Floats | None, NDArray[np.bool_] | None]:
-        """Return what `Errors` are asked about."""
+        """Return the arguments of the methods of `Errors`."""
         return self.predicted, self.class_id, self.stated_std, self.is_near
 
 
 @dataclass(frozen=True, slots=True)
 class Adapted:
-    """What a model, adapted or not, says of metres, shape (N,), with the ends of their intervals, and of their sum."""
+    """Predictions of metres with their intervals, shape (N,), and of their sum."""
 
     value: Floats
     low: Floats
@@ -84,15 +80,15 @@ class Adapted:
 
 
 def predict(errors: Errors, there: Metres) -> Adapted:
-    """Return what a model says of metres as it is."""
+    """Return the predictions of metres without adaptation."""
     low, high = errors.compute_intervals(*there.ground)
     return Adapted(there.predicted, low, high, errors.compute_sum(*there.ground))
 
 
 def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
-    """Return what a model says of metres, adapted by others of the same run or robot that were measured; at least one.
+    """Return the predictions of metres, adapted by one or more measured metres of the same run or robot.
 
-    Where it predicts nothing, the value is NaN, which is in no sum.
+    Metres without a prediction are NaN and in no sum.
     """
     has_cost = np.isfinite(there.predicted)
     if not has_cost.all():
@@ -135,7 +131,7 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
 
 
 def _make_design(metres: Metres, spread: Floats, per_metre: float, per_second: float) -> Floats:
-    """Return what each coefficient is multiplied with, shape (N, 5)."""
+    """Return the design matrix X, shape (N, 5)."""
     as_metres = np.column_stack([metres.rise_m / _RISE_M, np.abs(metres.turn_rad) / _TURN_RAD])
     idle = per_second * metres.duration_s
     return np.column_stack([spread, metres.predicted, idle, per_metre * np.nan_to_num(as_metres)])
@@ -159,67 +155,3 @@ class Run:
 
     name: str
     metres: Mapping[str, Metres]
-
-    def checksum(self) -> str:
-        """Return a hash of what adapts a model."""
-        arrays = [getattr(metres, field.name) for metres in self.metres.values() for field in fields(metres)]
-        known = [np.ascontiguousarray(values).tobytes() for values in arrays if values is not None]
-        return sha256(b"".join(known)).hexdigest()
-
-
-@dataclass(frozen=True, slots=True)
-class AdaptedErrors:
-    """Errors of one quantity on the rest of runs, after the first ``metres`` of each are known."""
-
-    quantity: str
-    metres: float
-    runs: int
-    samples: int
-    rmse: float
-    coverage_percent: float
-    """Of single metres, by 90 % intervals."""
-    total_error_percent: float
-    """Mean absolute error of the sums over the rests of runs."""
-    totals_inside: int
-    """Runs whose sum is inside its 90 % interval."""
-
-    def __str__(self) -> str:
-        """Return them as one line."""
-        unit, digits = ("s", 3) if self.quantity == "duration" else ("J", 1)
-        return (
-            f"{self.quantity} after {self.metres:g} m: RMSE {self.rmse:.{digits}f} {unit}, 90 % intervals cover "
-            f"{self.coverage_percent:.1f} % of {self.samples} metres; sums off by {self.total_error_percent:.1f} %, "
-            f"{self.totals_inside} of {self.runs} inside"
-        )
-
-
-_LEAST_REST = 10
-"""Metres that are left to predict, at least, of a run."""
-
-
-def compare_adaptations(
-    errors: Mapping[str, Errors], runs: Sequence[Run], known_m: Sequence[float]
-) -> Iterator[AdaptedErrors]:
-    """Yield errors on the rest of each run after so many metres of it are known.
-
-    The rest begins after the most metres, so that all rows are of the same metres; a run too short for some ``known_m`` is in none.
-    """
-    for quantity, error in errors.items():
-        parts = [(run.metres[quantity], np.cumsum(run.metres[quantity].length_m)) for run in runs]
-        parts = [(metres, ends_m) for metres, ends_m in parts if (ends_m > max(known_m)).sum() >= _LEAST_REST]
-        for metres_m in sorted(known_m) if parts else ():
-            found = [
-                (rest, adapt(error, known, rest) if len(known.predicted) else predict(error, rest))
-                for metres, ends_m in parts
-                for known, rest in [(metres.take(ends_m <= metres_m), metres.take(ends_m > max(known_m)))]
-            ]
-            off = np.concatenate([said.value - rest.measured for rest, said in found])
-            inside = [(said.low <= rest.measured) & (rest.measured <= said.high) for rest, said in found]
-            sums = np.array([rest.measured.sum() for rest, _ in found])
-            middle, low, high = np.array([[said.total.middle, *said.total.interval] for _, said in found]).T
-            yield AdaptedErrors(
-                quantity=quantity, metres=metres_m, runs=len(found), samples=len(off),
-                rmse=float(np.sqrt(np.mean(off**2))), coverage_percent=100.0 * float(np.concatenate(inside).mean()),
-                total_error_percent=100.0 * float(np.mean(np.abs(middle / sums - 1.0))),
-                totals_inside=int(((low <= sums) & (sums <= high)).sum()),
-            )  # fmt: skip

@@ -30,36 +30,36 @@ from tcpipe.tables.facts import PhysicsFit, PhysicsScore, PhysicsTerm
 
 Floats = NDArray[np.float64]
 
-FEWEST = 20  # segments to fit on, and of a class to have coefficients of its own
-_LEAST_SLOPE = 0.02  # standard deviation of the rises: on flatter ground weight and rolling cannot be distinguished
-_LEAST_SPEED = 0.1  # of the median: with less variation standing and rolling cannot be distinguished
+FEWEST = 20  # segments for a fit, and for coefficients of a class
+_LEAST_SLOPE = 0.02  # standard deviation of the rises; on flatter ground weight and rolling are not observable
+_LEAST_SPEED = 0.1  # variation of speed over its median; with less, idle power and rolling are not observable
 _LEAST_TURNS = (
-    5.0  # metres that vary as all turns do: a class whose own vary by less says nothing of what turning on it takes
+    5.0  # variance of a class's turns, in metres of the variance of all; with less its turning is not observable
 )
-_SURE = 0.005  # standard deviation of what halts tell of standing, of itself: looser, it takes over what rolling does
-_SUREST_WATT = 0.1  # and no less than this
-_FEWEST_DOWNHILL = 10  # segments that drive the robot: fewer tell no recovery
-# Where nearly all comes back, power is as straight downhill as uphill, and no bend tells the drivetrain.
-_MOST_RECOVERED = 0.9
-# Metres whose rise is nearer to the bend count less: slope varies within a metre, and there the mean of a bent line lies above it.
-_BEND = 0.1
-_STEPS = 100  # of reweighting at most
+_IDLE_STD = 0.005  # relative standard deviation of the measured idle power; with a larger one it would absorb rolling
+_LEAST_IDLE_STD_WATT = 0.1  # smallest standard deviation of the idle power [W]
+_FEWEST_DOWNHILL = 10  # segments that drive the robot, for the recovered share
+_MOST_RECOVERED = 0.9  # share above which power has no bend downhill, so that the drivetrain is not observable
+_BEND = 0.1  # distance of a rise from the bend below which a metre weighs less, since slope varies within a metre
+_STEPS = 100  # reweightings at most
 _HUBER = 1.345  # 95 % efficient for normal errors (Huber, Robust Statistics, 1981)
-_FINEST = 0.02  # of the power: no such model is better
-_PLAUSIBLE_RESISTANCE = 1.5  # coefficient of rolling resistance: tracks in deep sand stay below
-_BLOCK, _FEWEST_BLOCKS = 20, 20  # consecutive segments that may err alike, and how many such blocks there are at least
-_MOST_ROWS = 20_000  # that are fitted, evenly taken of more: coefficients are sure to a few per mille by then
+_FINEST = 0.02  # smallest residual standard deviation over the median power
+_PLAUSIBLE_RESISTANCE = 1.5  # largest coefficient of rolling resistance: tracks in deep sand are below
+_BLOCK, _FEWEST_BLOCKS = 20, 20  # segments of a block with correlated errors, and fewest blocks
+_MOST_ROWS = (
+    20_000  # rows of a fit, evenly selected from more; its coefficients have relative errors of a few per mille
+)
 
-_FOLDS = 5  # contiguous: neighbours of a held-out metre are held out, too
-_LEAST_JPM = 10.0  # a percentage of less says nothing, as in `tcpipe.learning.metrics`
+_FOLDS = 5  # contiguous parts of a drive, so that neighbours of a held-out metre are held out too
+_LEAST_JPM = 10.0  # smallest energy in a mean relative error [J/m], as in `tcpipe.learning.metrics`
 
-_ALWAYS = ("idle", "drivetrain")  # are paid on any grade, and never given back
+_ALWAYS = ("idle", "drivetrain")  # terms that cost power on any grade and are never recovered
 
 PHYSICS_UNITS = {"idle": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
 """Units of the terms of physics."""
 
 ALL = "all"
-"""The ground of a fit that knows no classes, and of classes with too few segments."""
+"""Name of the ground of a fit without classes, and of classes with too few segments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,7 @@ def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], idle_wat
     value, recovered = np.zeros(count), 0.0
     prior = None if idle_watt is None else np.zeros(count + 1)
     if prior is not None and idle_watt is not None:
-        prior[terms.index(("idle", ALL))] = 1.0 / max(_SURE * idle_watt, _SUREST_WATT)
+        prior[terms.index(("idle", ALL))] = 1.0 / max(_IDLE_STD * idle_watt, _LEAST_IDLE_STD_WATT)
     made, off, weight, scale = design, force, np.ones_like(force), 1.0
     for _ in range(_STEPS):
         wanted = design[:, ~always] @ value[~always]
@@ -272,7 +272,7 @@ def _estimate_covariance(
     length = max(1, min(_BLOCK, len(rows) // _FEWEST_BLOCKS))
     starts = np.arange(0, len(rows), length)
     left = np.add.reduceat(rows * (weight * off / scale)[:, None], starts, axis=0)
-    # Of the scatter between blocks, the coefficients took up their share.
+    # Correct the scatter between blocks for the fitted coefficients.
     few = len(starts) / max(len(starts) - rows.shape[1], 1.0)
     bread, meat = (rows * weight[:, None]).T @ rows, left.T @ left * few
     if prior is not None:

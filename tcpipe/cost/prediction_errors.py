@@ -1,6 +1,6 @@
 """Errors of a model's time and energy for a metre and for a path, estimated from held-out samples (ADR-25).
 
-Estimated are, in this order:
+They are, in this order:
 
 * the **bias** of each terrain class: the ratio of its metres' true and predicted sums, less one, as far as it is beyond chance. With
   b the ratio of a class, b0 that of all and s its standard error over blocks of the drives, b0 + (b - b0) max(0, 1 - s² / (b - b0)²)
@@ -12,10 +12,10 @@ Estimated are, in this order:
   freedom, whose scale is as uncertain.
 * the **correlation** of two metres of one run by their distance, from the products of errors over their spread. A segment's end is the
   next one's beginning, so that of neighbours may be negative; beyond, it never rises, and distances with few pairs are taken together.
-* the **variance of a run's own error**: how much more the means of runs differ than the correlated errors of their metres explain; few
-  runs tell it as Student's t.
-* the **common error** of the labels themselves (gain and zero of the power sensor, scale of a lone odometry): held-out samples have it
-  too, so that no residual shows it. It is the share of it in the sum of the labels, by the columns of their standard deviations.
+* the **variance of a run's own error**: variance of the means of runs beyond the correlated errors of their metres, widened
+  by Student's t for few runs.
+* the **common error** of the labels themselves (gain and zero of the power sensor, scale of a lone odometry): held-out samples contain it,
+  so that no residual shows it. Its share of the sum of the labels comes from the columns of their standard deviations.
 
 Ground near that of training samples has spreads, correlations and runs of its own, where enough held-out samples are of such ground.
 
@@ -52,15 +52,15 @@ NORMAL_HALF_WIDTH = 1.6448536269514722
 """Half-width of a normal interval of `COVERAGE`, in standard deviations."""
 _CLASSES = 256
 _HALFWAY = 20.0
-"""Samples of a class by which its spread is half its own, half that of all, as a geometric mean."""
+"""Samples of a class for which its spread is the geometric mean of its own and that of all."""
 _ENOUGH_RUNS, _BLOCK = 10, 20
-"""Runs are what errs alike in a bias; of fewer, so many consecutive held-out samples of one."""
+"""Fewest runs that are the clusters of a bias; with fewer, clusters are this many consecutive held-out samples."""
 _MOST_BIAS = 0.5
 _LAGS_M: Floats = np.concatenate([[0.0, 1.5], 2.0 ** np.arange(1.5, 13.0)])
 """Edges of the distances by which pairs are sorted: neighbours, and doubling to 6 km."""
 _FEWEST_PAIRS = 100
 _STEPS = np.unique(np.round(2.0 ** np.arange(0.0, 12.0, 0.5)).astype(np.int64))
-"""How many rows further the other of a pair stands: all distances are met, pairs grow with the rows, not with their square."""
+"""Distances of the two rows of a pair [rows]: the number of pairs grows with the rows, not with their square."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +181,7 @@ class Errors:
         below = above = 0.0
         for share, errors in parts:
             variance = max(errors.compute_variance(spread, errors.of_run), alone / spread.size)
-            # Errors of a single metre are no normal ones, sums nearly.
+            # Errors of sums are nearly normal, those of a metre are not.
             like_one = min(variance / float(spread.sum()) ** 2, 1.0)
             std = float(np.hypot(np.sqrt(variance), (size * errors.bias_std[class_id]).sum()))
             below += share * std * (like_one * -errors.low / NORMAL_HALF_WIDTH + 1.0 - like_one)
@@ -335,7 +335,7 @@ class _Held:
     way_m: Floats
     """Along its run."""
     fold: Ints
-    """That was held out with it."""
+    """Fold that was held out with it."""
     is_one_fold: bool
     stated: Mapping[str, Floats]
     """Standard deviations by the model; 0 where it states none."""
@@ -360,7 +360,7 @@ class _Held:
         rows = np.lexsort((start_ns, run))
         rows = rows[usable[rows]]
         pace, of_run = velocity[rows], run[rows]
-        # A segment's pace is its chord over its time: neighbours are a chord apart.
+        # Velocity is chord over time, so that neighbours are a chord apart.
         step_m = pace[:-1] * np.diff(start_ns[rows]) * 1e-9
         way_m = np.concatenate([[0.0], np.cumsum(np.where(np.diff(of_run) == 0, step_m, 0.0))])
         true, predicted = (

@@ -25,7 +25,7 @@ from tcpipe.formats.atomic import write_text
 from tcpipe.formats.json_files import read_json, write_json
 from tcpipe.formats.parquet import read_table
 from tcpipe.learning.baselines import SPLITS
-from tcpipe.learning.evaluation import EvaluateConfig, Evaluation, PlantCosts
+from tcpipe.learning.evaluation import EvaluateConfig, Evaluation
 from tcpipe.learning.evaluation_files import SAMPLES, run_evaluation
 from tcpipe.learning.fitting import FitConfig, ModelKind
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Ratio, mean_known
@@ -107,7 +107,6 @@ def run_benchmark(
     predictor: str | None = None,
     config: FitConfig | None = None,
     evaluating: EvaluateConfig | None = None,
-    plant: PlantCosts | None = None,
 ) -> BenchmarkResult:
     """Train and evaluate every kind on every dataset below ``out``.
 
@@ -117,7 +116,6 @@ def run_benchmark(
     seeds : trainings of a network or an own model; the other kinds are the same for each seed and are trained once.
     predictor : code of an own model, which joins the kinds.
     config, evaluating : settings of all trainings and evaluations.
-    plant : the best that can be predicted where the samples were simulated.
     """
     place, names = Path(out), [Path(dataset).name for dataset in datasets]
     if len(set(names)) < len(names):
@@ -135,9 +133,7 @@ def run_benchmark(
                 rules = replace(config or FitConfig(), model=kind, seed=seed)
                 times_s.append(_train(dataset, here, rules, own))
                 rules_here = replace(evaluating or EvaluateConfig(noise_draws=1), seed=seed)
-                done = run_evaluation(
-                    here / "model", dataset, here / "evaluation", config=rules_here, plant=plant, predictor=own
-                )
+                done = run_evaluation(here / "model", dataset, here / "evaluation", config=rules_here, predictor=own)
                 made.append(done.values)
                 tables.append(read_table(here / "evaluation" / SAMPLES))
             evaluations[name, kind] = made

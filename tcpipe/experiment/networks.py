@@ -27,7 +27,7 @@ from tcpipe.learning.training import make_samples
 logger = logging.getLogger("tcpipe")
 
 Floats = NDArray[np.float64]
-Batch = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+Batch = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 ALL_LAYERS, HEIGHTS, GRASS = "a net per class, all layers", "Wei & Isler, a net per class", "Wei & Isler, grass only"
 
@@ -43,24 +43,19 @@ class EnergySamples(Samples):
         """Energy [J], shape (N, 1)."""
         return self.split.column(self.inputs.outputs[0]).astype(np.float64)[:, None]
 
-    @property
-    def weights(self) -> Floats:
-        """Ones, shape (N, 1)."""
-        return np.ones_like(self.labels)
-
 
 class EnergyNetwork(NetworkModel):
     """ResNet-18 of one output, the energy of a metre."""
 
     @staticmethod
     def iterate_batches(fit: Samples, epoch: int) -> Iterator[Batch]:
-        """Yield patches, energies [J] and ones."""
+        """Yield patches and energies [J]."""
         config = fit.config
         batches = fit.split.batches(
             config.batch_size, shuffle=True, seed=config.seed, mirror=config.mirror, features=fit.inputs.outputs
         )
         for (patches, energies), _ in batches.epoch(epoch):
-            yield patches, energies, np.ones_like(energies)
+            yield patches, energies
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

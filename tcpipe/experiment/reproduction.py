@@ -1,4 +1,4 @@
-"""``tcpipe reproduce``: the paper's experiment from a simulated site to its claims; every stage is gone on from where it was stopped."""
+"""``tcpipe reproduce``: the paper's experiment from a simulated site to its claims; every stage resumes."""
 
 from __future__ import annotations
 
@@ -8,20 +8,17 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from tcpipe.errors import DatasetError, UsageError, clean_lines
 from tcpipe.experiment.benchmark import BenchmarkRow, list_tables, run_benchmark
+from tcpipe.experiment.claims import FEWEST_SEEDS, Claim, check_claims
 from tcpipe.experiment.networks import compare_networks
-from tcpipe.experiment.simulation_floor import FEWEST_SEEDS, Claim, check_claims, compute_true_costs
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.evaluation import UNKNOWN_DISTANCE, EvaluateConfig, Evaluation
-from tcpipe.learning.evaluation_files import SIMULATED
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.metrics import ALL, UNITS
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
@@ -33,12 +30,13 @@ from tcpipe.simulation import SimulatedSite, find_scenario, simulate
 logger = logging.getLogger("tcpipe")
 
 JSON, PAGE = "reproduction.json", "reproduction.html"
+SIMULATED = "The data are simulated: compare the pattern with the paper, not the numbers."
 SIMULATION_SEED = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """How large an experiment is."""
+    """Size of an experiment."""
 
     scenario: str
     fitting: FitConfig
@@ -47,7 +45,7 @@ class Experiment:
 
 
 FULL = Experiment("paper", FitConfig(epochs=40, patience=8), EvaluateConfig(noise_draws=5))
-"""The paper's size: fits two hours on two cores, a training."""
+"""The paper's size: two hours on two cores for each training."""
 
 SMALL = Experiment(
     "paper_quick",
@@ -55,7 +53,7 @@ SMALL = Experiment(
     EvaluateConfig(noise_draws=2),
     "This is the small site, with a narrow network: three short drives, some 300 training samples. Its figures are not the paper's size.",
 )
-"""Some minutes a training: enough of them for the claims, on few samples."""
+"""Some minutes for each training, for claims on few samples."""
 
 QUICK = Experiment(
     "paper_quick",
@@ -63,7 +61,7 @@ QUICK = Experiment(
     SMALL.evaluating,
     "This is a quick run: the small site, a narrow network, few epochs. It only shows that all steps run: do not use its numbers.",
 )
-"""Two minutes on two cores: everything runs, and nothing is learned well enough to believe a figure."""
+"""Two minutes on two cores: all steps run; its figures mean nothing."""
 
 Size = Literal["full", "small", "quick"]
 
@@ -87,15 +85,15 @@ class ReproductionSummary:
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """What was found; ``str`` of it is what the command prints."""
+    """Result of a reproduction; the command prints its ``str``."""
 
     directory: Path
     values: ReproductionSummary
     seconds: Mapping[str, float]
-    """Of the stages, of this call."""
+    """Duration of each stage in this call [s]."""
 
     def __str__(self) -> str:
-        """Return every claim and how it stands, as plain lines."""
+        """Return every claim with its verdict, as plain lines."""
         claims = self.values.claims
         verdicts = ", ".join(f"{count} {name}" for name, count in _count_verdicts(claims).items())
         return clean_lines(
@@ -116,11 +114,11 @@ def reproduce(
 
     Parameters
     ----------
-    directory : where everything goes: new, empty, or an earlier reproduction of the same size, which is gone on from.
+    directory : the output: new, empty, or an earlier reproduction of the same size, which resumes.
     size : the paper's; the small site, for claims over many trainings; or the same with few epochs, to see it run.
-    seeds : trainings; claims are decided by five or more.
+    seeds : number of trainings; five or more decide claims.
     jobs : logs read side by side.
-    baselines : train the networks of Wei and Isler; without them what is claimed of them is not measured.
+    baselines : train the networks of Wei and Isler; without them their claims are not measured.
     """
     place, plan = Path(directory), SIZES[size]
     clear(place)
@@ -132,9 +130,8 @@ def reproduce(
     with _measure_time(seconds, "ingest and build"):
         _build(place, site, jobs)
     with _measure_time(seconds, "train and evaluate"):
-        known = partial(compute_true_costs, replace(made.world, resistance=()), made.drives[0].robot)
         benchmark = run_benchmark(
-            [place / "dataset"], place, seeds=seeds, config=plan.fitting, evaluating=plan.evaluating, plant=known
+            [place / "dataset"], place, seeds=seeds, config=plan.fitting, evaluating=plan.evaluating
         )
     runs = benchmark.evaluations["dataset", "resnet18"]
     comparisons = [run.baselines for run in runs]
@@ -189,7 +186,7 @@ def _render_page(values: ReproductionSummary, runs: Sequence[Evaluation]) -> str
             Number(f"{len(runs)}", "training" if len(runs) == 1 else "trainings"),
         ],
         warnings=[SIMULATED, *([values.plan.warning] if values.plan.warning else [])],
-        sections=[_make_claims_section(claims, " ".join(audits)), _make_floor_section(runs), *tables],
+        sections=[_make_claims_section(claims, " ".join(audits)), *tables],
     )
 
 
@@ -212,18 +209,3 @@ def _make_claims_section(claims: Sequence[Claim], audit: str) -> Section:
     ratios = [(f"{claim.split}: {claim.says.rpartition(' beats ')[2]}", astuple(claim.ratio)) for claim in claims]
     plot = draw_ratios("claims", "RMSE ratio of E", ratios)
     return Section("Claims of the paper", text, header=header, rows=rows, plots=[plot])
-
-
-def _make_floor_section(runs: Sequence[Evaluation]) -> Section:
-    """Return the errors of a predictor that knows the simulator."""
-    rows = [
-        (split, quantity, f"{error.rmse:.3f} {UNITS[quantity]}", f"{error.mape_percent or float('nan'):.2f} %")
-        for split, part in runs[0].splits.items()
-        for quantity in ("E", "T")
-        if part.simulation_floor is not None
-        for error in [part.simulation_floor[quantity][ALL]]
-    ]
-    text = (
-        "It knows the simulator, map, path and turn without error; hidden variation and the noise of the labels remain."
-    )
-    return Section("Floor of the simulation", text, header=("", "", "RMSE", "MAPE"), rows=rows)

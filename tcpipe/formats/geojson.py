@@ -273,29 +273,14 @@ class LineFeature(Generic[P]):
 
 
 def read_line(path: Path) -> NDArray[np.float64]:
-    """Read the path of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2; `PathError` without one.
-
-    Several lines are a path where each begins at the end of the one before, as a way there and the way back.
-    """
+    """Read the path of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2; `PathError` without one, or with several lines."""
     try:
         features = list(_iterate_features(path))
     except RegionError as error:
         raise PathError(*error.problems) from None
-    if not features:
-        raise PathError(f"{path}: is empty; expected one LineString")
-    path_deg = _read_path_line(features[0])
-    for feature in features[1:]:
-        line_deg = _read_path_line(feature)
-        if (line_deg[0] != path_deg[-1]).any():
-            raise PathError(
-                f"{path}: has {len(features)} lines, of which one does not begin where another ends; a path is one line"
-            )
-        path_deg = np.concatenate([path_deg, line_deg[1:]])
-    return path_deg
-
-
-def _read_path_line(feature: tuple[str, Mapping[str, Any], Any]) -> NDArray[np.float64]:
-    where, _, geometry = feature
+    if len(features) != 1:
+        raise PathError(f"{path}: has {len(features)} features; expected one LineString")
+    where, _, geometry = features[0]
     try:
         (line, *more) = shapely.get_parts(_read_geometry(geometry))
     except ValueError as error:

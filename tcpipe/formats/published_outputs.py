@@ -24,7 +24,7 @@ from typing import NamedTuple
 import google_crc32c
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.atomic import make_lasting_scratch, make_scratch_directory, make_unique_name
+from tcpipe.formats.atomic import make_lasting_scratch, make_scratch_directory, make_unique_name, write_atomic_directory
 from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.integrity import Checksum, Checksums, compute_short_digest
 from tcpipe.formats.json_files import parse_json, parse_typed, parse_typed_json, to_json
@@ -127,6 +127,17 @@ def open_output(out: str | Path, card: str) -> Iterator[Path]:
         yield Path(out)
         return
     with write_output(str(out), card) as directory:
+        yield directory
+
+
+@contextmanager
+def publish_directory(out: str | Path, card: str) -> Iterator[Path]:
+    """Yield an empty directory whose files, a card among them, become ``out`` at the end, or the newest build at a URL."""
+    with (
+        write_output(str(out).rstrip("/"), card)
+        if is_url(out)
+        else write_atomic_directory(Path(out).absolute()) as directory
+    ):
         yield directory
 
 

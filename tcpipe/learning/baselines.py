@@ -19,7 +19,7 @@ from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.learning.fitting import FitConfig, ModelKind
 from tcpipe.learning.metrics import FEWEST_GROUPS, LEAST, Errors, Ratio, compare_errors, compute_errors
 from tcpipe.learning.models import Model
-from tcpipe.learning.physics_model import MeanModel, SplineModel
+from tcpipe.learning.physics_model import MeanModel
 from tcpipe.learning.predictions import Measured, Predicted
 from tcpipe.learning.predictor import Job, Prediction, Predictor, Samples, find_kind, predict_samples
 from tcpipe.learning.training import make_samples
@@ -30,23 +30,22 @@ logger = logging.getLogger("tcpipe")
 BASELINES: Mapping[str, type[Predictor]] = {
     "mean per class": MeanModel,
     "class and slope, linear": find_kind("linear"),
-    "class and slope, spline": SplineModel,
     "physics": find_kind("physics"),
     "gradient boosting": find_kind("boosting"),
 }
 """Simplest first."""
 
-SPLINE, TREES = "class and slope, spline", "gradient boosting"
+CURVES, TREES = "class and slope, linear", "gradient boosting"
 
 KIND_OF_BASELINE: Mapping[str, ModelKind] = {
-    "class and slope, linear": "linear", "physics": "physics", TREES: "boosting"
+    CURVES: "linear", "physics": "physics", TREES: "boosting"
 }  # fmt: skip
-"""Baselines that would be the model itself."""
+"""Kind of each baseline that is also a kind of model."""
 
 SPLITS = ("test", "unseen")
 
 _MOST_EQUAL = 1.005
-"""Ratio of errors up to which they count as equal: digits of rounding make no difference."""
+"""Ratio of RMSE up to which models are equal [1]: rounding changes it by less."""
 
 
 def compare_baselines(
@@ -107,7 +106,7 @@ def _fit_baselines(
 
 
 def _fit_baseline(kind: type[Predictor], train: Split, data: Dataset) -> tuple[Samples, Predictor, Prediction]:
-    """Return a fitted kind, and what the other folds say of each sample; NaN where these are too few, which centres nothing."""
+    """Return a fitted kind and held-out predictions of each sample; NaN if folds are too few, so that nothing is centred."""
     turn = tuple(
         feature.name for feature in available_features(read_extra_features(train)) if feature.name == "turn_radpm"
     )
@@ -156,7 +155,7 @@ def compare_with_baseline(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BaselineResult:
-    """A baseline beside the model, on the same samples: its errors, and the ratios of the model's to them."""
+    """Errors of a baseline on the samples of the model, and the ratio of the model's RMSE to its."""
 
     baseline: str
     split: str
@@ -165,7 +164,7 @@ class BaselineResult:
     rmse_ratio: Ratio
     """RMSE of the model divided by that of the baseline: below 1 the model is better."""
     groups: int
-    """That the intervals were drawn from."""
+    """Number of groups in the bootstrap."""
     drawn_by: Literal["runs", "blocks"]
 
     @property

@@ -1,23 +1,21 @@
-"""The paper's section V for any model and dataset, tables I to III and V, with the labels' own noise beside them."""
+"""Evaluation as in the paper's section V for any model and dataset: tables I to III and V, with the noise floor of the labels."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.cost.coverage import Coverage, find_miscalibration, measure_coverage
 from tcpipe.dataset import Dataset, Split, open_dataset
-from tcpipe.dataset.energies import ENERGIES, Energy, EnergyName
+from tcpipe.dataset.energies import EnergyName
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.learning.baselines import (
     KIND_OF_BASELINE,
@@ -30,11 +28,9 @@ from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import (
     ALL,
     LEAST,
-    Array,
     Errors,
     Spread,
     average_draws,
-    compute_costs,
     compute_errors,
     compute_errors_by_class,
     compute_label_floor,
@@ -51,12 +47,11 @@ from tcpipe.learning.predictions import (
     predict_costs,
     predict_spreads,
 )
-from tcpipe.learning.predictor import Prediction
 from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, LOCAL_PLACES, PLACES, are_near, compute_middles
 from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.facts import ABSENT, Floor
+from tcpipe.tables.facts import ABSENT
 from tcpipe.tables.findings import (
     PREDICTED,
     Affected,
@@ -81,7 +76,7 @@ ErrorsByClass: TypeAlias = Mapping[str, Mapping[str, Errors]]
 
 @dataclass(frozen=True, slots=True)
 class EvaluateConfig:
-    """How much is evaluated."""
+    """Size of an evaluation."""
 
     noise_draws: Annotated[int, Bounds(ge=1, le=1000)] = 5
     """Draws of noise that each ablated input set is the mean of."""
@@ -91,18 +86,18 @@ class EvaluateConfig:
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedModel:
-    """Which model was evaluated."""
+    """The evaluated model."""
 
     name: str
     checksum: str
     training: Training
     label_energy: EnergyName = "total"
-    """Which power and energy it predicts, and was measured by."""
+    """Kind of power and energy that it predicts."""
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedDataset:
-    """On which dataset."""
+    """The dataset of an evaluation."""
 
     name: str
     sha256: str
@@ -113,15 +108,15 @@ class EvaluatedDataset:
 
 @dataclass(frozen=True, slots=True)
 class Leakage:
-    """What of a split stands beside training, of the dataset that the evaluation is on."""
+    """Nearness of a split to the training samples of the dataset."""
 
     holdout: str
-    """How test was drawn: by sample, as in the paper, block, run or tag."""
+    """Holdout of the test split: sample, as in the paper, block, run or tag."""
     within_m: float
     near_percent: float
-    """Samples whose middle is within that of one of train."""
+    """Share of samples whose middle is within ``within_m`` of that of a training sample [%]."""
     sharing_percent: float | None
-    """Samples whose footprint shares ground with one of train, by the dataset's own audit."""
+    """Share of samples whose footprint overlaps that of a training sample, by the dataset's audit [%]."""
 
     def __str__(self) -> str:
         """Return how near to training a split is, in words."""
@@ -134,7 +129,7 @@ class Leakage:
 
 @dataclass(frozen=True, slots=True)
 class SplitErrors:
-    """Tables I and II of one split, and what its labels' deviations, or the simulator, allow."""
+    """Tables I and II of one split, and the noise floor of its labels."""
 
     samples: int
     classes: Mapping[str, int]
@@ -146,21 +141,13 @@ class SplitErrors:
     path_error_percent: Mapping[str, float]
     """Error of the sums of `PATH_M` m of a run, by quantity (T, E)."""
     label_floor: ErrorsByClass
-    simulation_floor: ErrorsByClass | None = field(default=None, metadata=ABSENT)
-    """Errors of the best possible predictor; known for simulated samples only."""
     leakage: Leakage | None = field(default=None, metadata=ABSENT)
-    """How much of it was met in training; None where nothing trains, or places are not known."""
-
-    @property
-    def floors(self) -> dict[str, ErrorsByClass]:
-        """Return what an error can hardly be less than, by its key."""
-        simulated = {} if self.simulation_floor is None else {"simulation_floor": self.simulation_floor}
-        return {"label_floor": self.label_floor, **simulated}
+    """Nearness to training; None without training samples or places."""
 
 
 @dataclass(frozen=True, slots=True)
 class AblationRow:
-    """A row of table III: layers that are left, the others being noise, and the errors by split and quantity."""
+    """A row of table III: the layers that are not replaced by noise, and the errors by split and quantity."""
 
     layers: tuple[str, ...]
     errors: Mapping[str, Mapping[str, Errors]]
@@ -171,7 +158,7 @@ class Evaluation:
     """All of evaluation.json."""
 
     kind: str = KIND
-    schema_version: int = 4
+    schema_version: int = 5
     tcpipe_version: str
     key: str
     """Hash of model, dataset and options: the same key, the same evaluation."""
@@ -182,12 +169,8 @@ class Evaluation:
     ablation: tuple[AblationRow, ...]
     time: Mapping[str, Mapping[str, Errors]]
     """Table V: errors of T by predictor and split."""
-    blocks: ErrorsByClass | None = field(default=None, metadata=ABSENT)
-    """Errors of the model on its held-out samples: blocks of ground that it was not fitted on."""
     baselines: tuple[BaselineResult, ...] = ()
     """Comparisons with baselines over all classes, by split, baseline and quantity."""
-    repeatability: Mapping[str, Floor | None]
-    """How well each label repeats itself where ground was driven twice; None where none was."""
     findings: tuple[Finding, ...] = ()
     verdict: Verdict = field(default_factory=Verdict)
 
@@ -200,7 +183,7 @@ class Evaluation:
 
     @property
     def judged(self) -> tuple[Affected, ...]:
-        """Return what the verdict is about."""
+        """Return the labels of the verdict."""
         return PREDICTED if "E" in self.costs else ("time",)
 
     @property
@@ -210,19 +193,16 @@ class Evaluation:
 
 
 INPUT_SETS = (("O", "C", "H"), ("C", "H"), ("O", "H"), ("O", "C"), ("O",), ("C",), ("H",))
-"""Layers that are left, in the order of table III."""
+"""Layers that are not replaced, in the order of table III."""
 
 LETTERS = {"O": "ortho", "C": "terrain", "H": "height"}
 
 OURS, EXPECTED = "ours", "expected time"
 UNKNOWN_DISTANCE = "Its distance from training is unknown."
 
-PlantCosts = Callable[[Split], dict[str, Array]]
-"""Costs of samples by a predictor that knows how they were simulated."""
-
 Sets = dict[str, Measured]
 Said = Mapping[str, Predicted]
-"""What a model says of each split."""
+"""Predictions of each split."""
 
 
 def evaluate(
@@ -231,15 +211,9 @@ def evaluate(
     config: EvaluateConfig,
     *,
     key: str,
-    plant: PlantCosts | None = None,
     predictor: str | None = None,
 ) -> tuple[Evaluation, pa.Table]:
-    """Measure a model on a dataset and return everything that was found, which ``key`` tells from any other evaluation.
-
-    Beside it stands what was measured and predicted of every sample (`tcpipe.learning.predictions`).
-
-    ``plant`` is the best that can be predicted where the samples were simulated.
-    """
+    """Measure a model on a dataset; return the evaluation, with the hash ``key``, and the table of all predictions."""
     ours = load_model(model, predictor)
     data = open_dataset(dataset, label=ours.card.label_energy)
     check_fit(ours.card, data, str(model))
@@ -261,12 +235,10 @@ def evaluate(
         model=EvaluatedModel(ours.name, ours.checksum, ours.card.training, ours.card.label_energy),
         dataset=EvaluatedDataset(data.card.name, compute_dataset_checksum(data.card), data.card.splits),
         config=config,
-        splits={name: _measure_split(data, part, said[name], spreads[name], plant) for name, part in sets.items()},
+        splits={name: _measure_split(data, part, said[name], spreads[name]) for name, part in sets.items()},
         ablation=tuple(_iterate_ablation(ours, sets, config)),
         time=_compare_times(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.card.robot, data)),
         baselines=tuple(baselines),
-        blocks=compute_block_errors(ours, names),
-        repeatability=_estimate_repeatability(data.card, ENERGIES[ours.card.label_energy]),
     )
     findings = (*lacking, *_find_mismatches(ours, data, sets), *find_weaknesses(evaluation))
     evaluation = replace(evaluation, findings=findings, verdict=judge(findings))
@@ -275,26 +247,14 @@ def evaluate(
     )
 
 
-def _estimate_repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floor | None]:
-    """Return how well each label repeats itself where ground was driven twice, as the dataset's card has it; None where it was not."""
-    columns = {"w": energy.power, "v": card.label.columns[1], "T": "duration_s", "E": energy.energy}
-    found = card.repeatability
-    return {quantity: found.get(column) for quantity, column in columns.items()}
-
-
-def _measure_split(
-    data: Dataset, found: Measured, said: Predicted, spreads: Mapping[str, Spread], plant: PlantCosts | None
-) -> SplitErrors:
-    def compute_by_class(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
-        return compute_errors_by_class(costs, found.costs, found.class_ids, found.names, spreads)
-
+def _measure_split(data: Dataset, found: Measured, said: Predicted, spreads: Mapping[str, Spread]) -> SplitErrors:
     runs, start_ns = found.split.column("run_id"), found.split.column("start_ns")
     counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
     return SplitErrors(
         samples=len(found.split),
         classes=counts,
         class_order=tuple(counts),
-        errors=compute_by_class(said.costs, spreads),
+        errors=compute_errors_by_class(said.costs, found.costs, found.class_ids, found.names, spreads),
         coverage={
             quantity: measure_coverage(
                 (spread.low <= found.costs[quantity]) & (found.costs[quantity] <= spread.high), runs
@@ -308,7 +268,6 @@ def _measure_split(
         },
         leakage=measure_leakage(data, found.split),
         label_floor=compute_label_floor(found.own_deviations, found.costs, found.class_ids, found.names),
-        simulation_floor=None if plant is None else compute_by_class(plant(found.split)),
     )
 
 
@@ -340,7 +299,7 @@ def _list_input_sets(ours: Model) -> list[tuple[str, ...]]:
 
 
 def _compute_errors(said: Predicted, found: Measured, by: Model) -> dict[str, Errors]:
-    """Return the errors of all classes, and how well a model told them."""
+    """Return the errors of all classes, with the scores of the stated errors."""
     spreads = predict_spreads(by, said, found)
     by_class = compute_errors_by_class(said.costs, found.costs, found.class_ids, found.names, spreads)
     return {quantity: by_class[quantity][ALL] for quantity in by_class}
@@ -368,7 +327,7 @@ def _compare_times(
 
 
 def _find_mismatches(ours: Model, data: Dataset, sets: Sets) -> Iterator[Finding]:
-    """Yield where model and dataset do not fit, and the samples without a label."""
+    """Yield mismatches of model and dataset, and the samples without a label."""
     if compute_dataset_checksum(data.card) != ours.card.dataset.sha256:
         names = {"dataset": ours.card.dataset.name}
         yield make_finding("model-of-another-dataset", Subject("model", ours.name), names=names)
@@ -381,9 +340,6 @@ def _find_mismatches(ours: Model, data: Dataset, sets: Sets) -> Iterator[Finding
                 yield make_finding("class-not-in-training", unseen, names={"split": name}, sample_count=count)
         if unlabelled := total - len(found.split):
             yield make_finding("samples-without-label", subject, unlabelled_count=unlabelled, sample_count=total)
-
-
-_UNKNOWN = {0: "unknown"}
 
 
 def measure_leakage(data: Dataset, held: Split) -> Leakage | None:
@@ -399,33 +355,11 @@ def measure_leakage(data: Dataset, held: Split) -> Leakage | None:
     return Leakage(data.card.recipe.split.holdout, within_m, 100.0 * float(near.mean()), sharing)
 
 
-def compute_block_errors(model: Model, names: Mapping[int, str]) -> ErrorsByClass | None:
-    """Return the errors on the samples that a model keeps as held out, by class; None if it keeps none of power and velocity.
-
-    Folds are blocks of ground, so that this is what the errors are where blocks are held out. A network was stopped by its fold, and
-    of a table the folds told how many trees are best: both are a little too small.
-    """
-    found: Mapping[str, NDArray[np.generic]] = model.residuals
-    if "power_predicted_watt" not in found or not len(found["power_predicted_watt"]):
-        return None
-    power, velocity, *said = (
-        found[name].astype(np.float64)
-        for name in ("power_watt", "velocity_mps", "power_predicted_watt", "velocity_predicted_mps")
-    )
-    class_ids = np.nan_to_num(found["terrain_class"].astype(np.float64)).astype(np.int64)
-    centred = Predicted.centre(
-        model.residuals, Prediction.without_covariance(np.column_stack(said)), class_ids, model.card.chord_m
-    )
-    known = {**_UNKNOWN, **names}
-    own = {number: known.get(number, str(number)) for number in np.unique(class_ids).tolist()}
-    return compute_errors_by_class(centred.costs, compute_costs(power, velocity, model.card.chord_m), class_ids, own)
-
-
 _QUANTITIES = {"energy": "E", "time": "T"}
 
 
 def find_large_error(error: float, name: str, subject: Subject) -> Iterator[Finding]:
-    """Yield that a sum of ``time`` or ``energy`` is off by a share that needs care, or by one that forbids to use it."""
+    """Yield that the error of a sum of ``time`` or ``energy`` needs care, or makes it unusable."""
     code = f"{name}-far-off"
     if error >= read_threshold(code, "max_usable_fraction"):
         severity: Severity = "error" if error >= read_threshold(code, "max_error_fraction") else "warning"
@@ -433,7 +367,7 @@ def find_large_error(error: float, name: str, subject: Subject) -> Iterator[Find
 
 
 def find_weaknesses(found: Evaluation) -> Iterator[Finding]:
-    """Yield what the errors of each split show, and that there is no unseen split."""
+    """Yield the findings on the errors of each split, and on a missing unseen split."""
     for split in found.ordered_splits:
         part, subject = found.splits[split], Subject("split", split)
         yield from _find_large_errors(part, subject)

@@ -2,9 +2,9 @@
 
 ::
 
-    evaluation.json       errors by split, quantity and class, beside what the labels' own noise allows
+    evaluation.json       errors by split, quantity and class, with the noise floor of the labels
     evaluation.html       the page
-    predictions.parquet   what was measured and predicted of every sample
+    predictions.parquet   labels and predictions of every sample
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tcpipe import __version__
-from tcpipe.errors import StoreError, UsageError, clean_lines
+from tcpipe.errors import UsageError, clean_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.finding_lines import format_findings, list_verdict
@@ -21,16 +21,20 @@ from tcpipe.formats.integrity import seal_document
 from tcpipe.formats.json_files import digest, parse_json, parse_typed, write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import write_table
-from tcpipe.formats.published_outputs import fetch_directory, fetch_directory_by_range, find_newest, open_output
+from tcpipe.formats.published_outputs import (
+    fetch_directory,
+    fetch_directory_by_range,
+    find_newest,
+    open_output,
+    require_card,
+)
 from tcpipe.learning.baselines import describe_ratios
-from tcpipe.learning.evaluation import UNKNOWN_DISTANCE, EvaluateConfig, Evaluation, PlantCosts, evaluate
+from tcpipe.learning.evaluation import UNKNOWN_DISTANCE, EvaluateConfig, Evaluation, evaluate
 from tcpipe.learning.evaluation_page import render_evaluation_page
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
 from tcpipe.learning.own_models import load_own_kind
 from tcpipe.learning.training import compute_dataset_checksum
-
-SIMULATED = "The data are simulated: compare the pattern with the paper, not the numbers."
 
 JSON, PAGE, SAMPLES = "evaluation.json", "evaluation.html", "predictions.parquet"
 
@@ -71,7 +75,6 @@ def run_evaluation(
     out: str | Path = "evaluation",
     *,
     config: EvaluateConfig | None = None,
-    plant: PlantCosts | None = None,
     predictor: str | None = None,
 ) -> EvaluationResult:
     """Evaluate a model on a dataset into the directory ``out``: new, empty, or an earlier evaluation.
@@ -80,31 +83,23 @@ def run_evaluation(
     """
     rules = config or EvaluateConfig()
     own = [] if predictor is None else [load_own_kind(predictor).digest]
-    key = _make_key(model, dataset, rules, own, simulated=plant is not None)
+    key = _make_key(model, dataset, rules, own)
     if not is_url(out):
         _check_directory(Path(out))
     if (known := _read_known(out, key)) is not None:
         return known
     with open_output(out, JSON) as place:
-        found, table = evaluate(model, dataset, rules, key=key, plant=plant, predictor=predictor)
-        if _make_key(model, dataset, rules, own, simulated=plant is not None) != key:
-            raise StoreError(
-                f"{dataset} or {model}: another call has replaced it in the meantime; run the command again"
-            )
-        page = render_evaluation_page(found, table, warnings=[SIMULATED] if plant else [])
+        found, table = evaluate(model, dataset, rules, key=key, predictor=predictor)
         write_table(table, place / SAMPLES)
-        write_text(place / PAGE, page)
-        write_json(place / JSON, found)  # last: with it the evaluation is whole
-    written = _read_known(out, key)
-    if written is None:
-        raise StoreError(f"{out}: another call has replaced it in the meantime; run the command again")
-    return written
+        write_text(place / PAGE, render_evaluation_page(found, table))
+        write_json(place / JSON, found)  # last: it makes the evaluation complete
+    return EvaluationResult(require_card(str(out), [JSON]).place.where(), found)
 
 
 def _check_directory(place: Path) -> None:
     """Raise `UsageError` for something else than an earlier evaluation."""
     clear(place)
-    ours = {JSON, PAGE, SAMPLES, "adaptation.json", "drives.json"}
+    ours = {JSON, PAGE, SAMPLES, "drives.json"}
     if place.exists() and (
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
     ):
@@ -122,15 +117,12 @@ def _read_known(out: str | Path, key: str) -> EvaluationResult | None:
     return EvaluationResult(found.place.where(), parse_typed(values, Evaluation, where))
 
 
-def _make_key(
-    model: str | Path, dataset: str | Path, config: EvaluateConfig, own: list[str], *, simulated: bool
-) -> str:
-    """Return the text that identifies an evaluation."""
+def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, own: list[str]) -> str:
+    """Return the hash that identifies an evaluation."""
     lines = [
         seal_document(read_model_card(fetch_directory(model))),
         compute_dataset_checksum(read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])),
         asdict(config),
-        simulated,
         __version__,
         *own,
     ]

@@ -1,12 +1,8 @@
-"""The page of an evaluation: a verdict, its samples, and its tables beside those of the paper.
-
-The paper's own results (Eder and Steinbauer-Wagner, section V) stand beside a dataset's: tables I to V.
-"""
+"""The page of an evaluation: a verdict, its samples, and its tables with those of the paper (Eder and Steinbauer-Wagner, section V)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -19,17 +15,15 @@ from tcpipe.cost.coverage import Coverage
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.learning.baselines import SPLITS
 from tcpipe.learning.evaluation import EXPECTED, OURS, UNKNOWN_DISTANCE, Evaluation
-from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
+from tcpipe.learning.metrics import ALL, LEAST, UNITS, Errors
 from tcpipe.learning.predictions import (
-    LEVELS,
-    compute_calibration,
     compute_cost_errors,
     find_main_cost,
     find_worst_rows,
     make_column_name,
 )
 from tcpipe.learning.predictor import find_kind
-from tcpipe.report.colours import CLASS_COLOURS, FAINT, find_class_colour
+from tcpipe.report.colours import FAINT, find_class_colour
 from tcpipe.report.page import (
     Number,
     Section,
@@ -37,12 +31,9 @@ from tcpipe.report.page import (
     render_page,
     show_verdict,
 )
-from tcpipe.report.plots import Plot, draw_ratios, make_plot, show_text
+from tcpipe.report.plots import Plot, make_plot, show_text
 from tcpipe.tables.columns import to_floats, to_texts
 from tcpipe.tables.findings import judge_again, read_threshold
-
-FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
-"""Lower bounds of errors, and their names on the page."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
 
@@ -53,8 +44,8 @@ _DIGITS = {"w": 2, "v": 3, "T": 3, "E": 2}
 _CALLED = {"test": "test samples of the known area", "unseen": "the unseen area"}
 
 
-def render_evaluation_page(found: Evaluation, table: pa.Table, *, warnings: Sequence[str] = ()) -> str:
-    """Return the HTML page of what `evaluate` found, with its table of predictions; ``warnings`` come first."""
+def render_evaluation_page(found: Evaluation, table: pa.Table) -> str:
+    """Return the HTML page of an evaluation and its table of predictions."""
     name, of_power = found.dataset.name, found.model.label_energy
     note = "" if of_power == "total" else f" (w and E {ENERGIES[of_power].words})"
     costs = "time T and energy E" if "E" in found.costs else "time T"
@@ -68,7 +59,7 @@ def render_evaluation_page(found: Evaluation, table: pa.Table, *, warnings: Sequ
     sections = [
         draw_predictions(table, " ".join(audits)),
         _make_baselines_section(found),
-        _make_coverage_section(found, table),
+        _make_coverage_section(found),
         make_slope_section(table),
         make_worst_section(table),
         paper,
@@ -85,7 +76,6 @@ def render_evaluation_page(found: Evaluation, table: pa.Table, *, warnings: Sequ
             for quantity in found.costs
         ],
         verdict=show_verdict(judge_again(found.verdict, found.findings), found.findings, labels=found.judged),
-        warnings=warnings,
         sections=[section for section in sections if section.rows or section.text],
     )
 
@@ -118,35 +108,30 @@ def _make_baselines_section(found: Evaluation) -> Section:
     rows: list[tuple[str, ...]] = []
     for quantity in found.costs:
         own = (found.splits[split].errors[quantity][ALL] for split in splits)
-        rows.append((quantity, "the model", *(_format_figure(error, "rmse", quantity) for error in own)))
+        cells = (cell for error in own for cell in (_format_figure(error, "rmse", quantity), ""))
+        rows.append((quantity, "the model", *cells))
         for name in names:
-            results = (by_cell.get((name, split, quantity)) for split in splits)
-            cells = (_format_figure(None if row is None else row.errors, "rmse", quantity) for row in results)
+            results = [by_cell.get((name, split, quantity)) for split in splits]
+            cells = (
+                cell
+                for row in results
+                for cell in (
+                    _format_figure(None if row is None else row.errors, "rmse", quantity),
+                    "" if row is None else str(row.rmse_ratio),
+                )
+            )
             rows.append(("", name, *cells))
-    header = ("", "", *(f"{split}, RMSE" for split in splits))
+    header = ("", "", *(f"{split}, {column}" for split in splits for column in ("RMSE", "ratio")))
     text = (
-        "RMSE of the model over that of each baseline, on the same samples, with its 95 % interval: left of 1 the model is better.\n"
+        "Ratio: RMSE of the model over that of each baseline, on the same samples, with its 95 % interval; below 1 the model is better.\n"
         "All are centred by class with the same rule, from their own held-out predictions (evaluation.json has all ratios). "
         "Intervals: paired bootstrap over runs or blocks, ten at least. Physics and boosting also know the turn of each segment."
     )
-    table = Section("RMSE", header=header, rows=rows)
-    plots = [
-        draw_ratios(
-            f"ratio {quantity}",
-            f"RMSE ratio of {quantity}",
-            [
-                (f"{split}: {name}", astuple(row.rmse_ratio))
-                for (name, split, row_quantity), row in by_cell.items()
-                if row_quantity == quantity
-            ],
-        )
-        for quantity in found.costs
-    ]
-    return Section(title, text, plots=plots, parts=[table])
+    return Section(title, text, header=header, rows=rows)
 
 
-def _make_coverage_section(found: Evaluation, table: pa.Table) -> Section:
-    """Return how well the model knows its errors: calibration, and the share of labels that 90 % intervals cover, with its own interval."""
+def _make_coverage_section(found: Evaluation) -> Section:
+    """Return the coverage of 90 % intervals with its own interval, and the scores of the stated errors."""
     rows = [
         (
             split,
@@ -164,17 +149,16 @@ def _make_coverage_section(found: Evaluation, table: pa.Table) -> Section:
     if not rows:
         return Section("Uncertainty", "The model states no uncertainty: too few samples were held out.")
     training = found.model.training
-    count, config = training.samples["held out"], training.config
-    is_network = find_kind(training.kind).stops_by_fold and not config.cross_fit
+    is_network, count = find_kind(training.kind).stops_by_fold, training.samples["held out"]
+    held_out = (
+        "that stopped it early, so that they are slightly too narrow" if is_network else "predicted by the other folds"
+    )
     text = (
-        "Share of labels below each quantile of the stated errors; on the diagonal the model is calibrated.\n"
-        "Steeper in the middle: underconfident; flatter: overconfident; all above: too large. Intervals rest on "
-        f"errors on {count} samples of train "
-        f"{'that stopped it early, which makes them slightly too small' if is_network else ', each predicted by the other folds'}. "
-        "The 95 % CI of a coverage, where there are enough runs, is binomial, clustered by run."
+        f"Intervals rest on errors on {count} samples of train {held_out}. The 95 % CI of a coverage, if there are enough runs, is "
+        "binomial, clustered by run."
     )
     header = ("", "", "inside the 90 % interval", "NLL [nat]", "CRPS")
-    return Section("Uncertainty", text, header=header, rows=rows, plots=draw_calibration(table))
+    return Section("Uncertainty", text, header=header, rows=rows)
 
 
 def _format_coverage(coverage: Coverage) -> str:
@@ -213,17 +197,11 @@ def _iterate_class_rows(found: Evaluation, split: str, quantity: str) -> Iterato
         yield ("", "paper", *(_format_paper_figure(of_paper.get(name)) for name in classes))
         if measure != "rmse":
             continue
-        if split == "test" and found.blocks is not None:
-            yield make_row("", "blocks of train", found.blocks[quantity], measure)
-        for floor, errors in part.floors.items():
-            yield make_row("", FLOORS[floor], errors[quantity], measure)
-        if (repeats := found.repeatability[quantity]) is not None:
-            blank = [""] * len(part.classes)
-            yield ("", "repeatability", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}")
+        yield make_row("", "label noise alone", part.label_floor[quantity], measure)
 
 
 _TEXT = {
-    "test": "Blocks of train are held out. Label noise alone: the error of a perfect prediction, by what labels of a run do not share.",
+    "test": "Label noise alone: the error of a perfect prediction, without the error that all labels of a run share.",
     "unseen": "The paper calls it validation; tcpipe uses it neither for tuning nor for early stopping.",
 }
 
@@ -294,9 +272,8 @@ PAPER = {
 
 
 _CALLED_QUANTITY = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}
-_COLOURS = dict(zip(QUANTITIES, CLASS_COLOURS, strict=False))
 _MOST_DRAWN = 5_000
-"""Samples in a scatter plot: the first ones, in random order."""
+"""Largest number of samples in a scatter plot; samples are in random order."""
 _WORST = 10
 """Samples of each split in the table of the largest errors."""
 _SLOPE_EDGES_DEG = (-15.0, -10.0, -5.0, -2.0, 2.0, 5.0, 10.0, 15.0)
@@ -306,12 +283,12 @@ _SLOPE_NAMES = (
     *("2° to 5°", "5° to 10°", "10° to 15°", "above 15°"),
 )
 _WHOLE_JOULE = 10.0
-"""Error of E from which whole joules suffice, so that nine ranges of slope fit."""
+"""RMSE of E from which whole joules are printed [J], so that nine ranges of slope fit."""
 
 
 def draw_predictions(table: pa.Table, audit: str) -> Section:
     """Return a point for each sample, E and T; ``audit`` says how far they are from training."""
-    text = "Each point is a segment, coloured by class; on the line the prediction is exact. Point at one for its name and errors."
+    text = "Each point is a segment, coloured by class; on the line the prediction is exact. Point at one for its name."
     drawn = table.slice(0, _MOST_DRAWN)
     if drawn.num_rows < table.num_rows:
         text += f" {drawn.num_rows} of {table.num_rows} are drawn, at random."
@@ -332,28 +309,13 @@ def draw_predictions(table: pa.Table, audit: str) -> Section:
         )
         source = {
             "x": label[known], "y": said[known], "colour": [legend[str(name)] for name in names[known]],
-            "text": _describe_rows(drawn.filter(pa.array(known)), quantity),
+            "text": to_texts(drawn.column("sample_id"))[known].tolist(),
         }  # fmt: skip
         show_text(plot, plot.figure.scatter("x", "y", size=5, color="colour", alpha=0.6, source=source))
         ends = [float(label[known].min()), float(label[known].max())]
         plot.figure.line(ends, ends, color=FAINT, line_width=2, line_dash="dashed")
         plots.append(plot)
     return Section("Measured against predicted", f"{text}\n{audit}", plots=plots)
-
-
-def _describe_rows(table: pa.Table, quantity: str) -> list[str]:
-    """Return one line a sample: its name, ground, and what was measured and predicted."""
-    label, said = (to_floats(table, make_column_name(quantity, part)) for part in ("", "predicted"))
-    ids, names, slope = (
-        to_texts(table.column("sample_id")),
-        to_texts(table.column("terrain_name")),
-        _read_slope_deg(table),
-    )
-    digits = 0 if quantity == "E" else 2
-    return [
-        f"{sample}: {name}, {degrees:.1f}°, measured {true:.{digits}f}, predicted {found:.{digits}f} {UNITS[quantity]}"
-        for sample, name, degrees, true, found in zip(ids, names, slope, label, said, strict=True)
-    ]
 
 
 def _read_slope_deg(table: pa.Table) -> NDArray[np.float64]:
@@ -416,33 +378,3 @@ def make_slope_section(table: pa.Table) -> Section:
     header = ["split", "class", *(_SLOPE_NAMES[at].replace(" to ", "…") for at in columns)]
     rows = [[*line, *(shade((*line, at)) for at in columns)] for line in sorted(lines)]
     return Section("Error by class and slope", text, header=header, rows=rows)
-
-
-def draw_calibration(table: pa.Table) -> list[Plot]:
-    """Return for each split the share of labels below each quantile that the model states."""
-    plots: list[Plot] = []
-    for split in pc.unique(table.column("split")).to_pylist():
-        part = table.filter(pc.equal(table.column("split"), split))
-        found = {q: shares for q in QUANTITIES if (shares := compute_calibration(part, q)) is not None}
-        if not found:
-            continue
-        plot = make_plot(
-            f"calibration {split}",
-            alt=f"Share of labels of {split} below each quantile that the model states; on the diagonal the model is calibrated.",
-            axes=("share stated", f"share of {split} labels below"),
-            legend={} if plots else {_CALLED_QUANTITY[q]: _COLOURS[q] for q in found},
-            height_px=320,
-            tools="save,hover",
-            waits=True,
-        )
-        plot.figure.hover.tooltips = [("", "$name"), ("stated", "@stated{0 %}"), ("found", "@found{0.0 %}")]
-        plot.figure.line([0, 1], [0, 1], color=FAINT, line_dash="dashed", line_width=2, name="known")
-        lines = [
-            plot.figure.line(
-                "stated", "found", source={"stated": LEVELS, "found": shares}, color=_COLOURS[q], line_width=2, name=_CALLED_QUANTITY[q]
-            )
-            for q, shares in found.items()
-        ]  # fmt: skip
-        plot.figure.hover.renderers = lines
-        plots.append(plot)
-    return plots

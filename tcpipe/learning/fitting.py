@@ -29,22 +29,20 @@ ModelKind = Literal["linear", "physics", "boosting", "resnet18", "own"]
 Loss = Literal["nrmse", "paper_eq4"]
 
 Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
-"""What every generator of random numbers takes."""
+"""Seed of a random number generator."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitConfig(TrainConfig):
-    """How a model is trained: the settings of the recipe, and the choices of a call."""
+    """Settings of a training: those of the recipe, and those of a call."""
 
     model: ModelKind | Literal["auto"] = "resnet18"
     """``auto``: chosen by cross-validation over runs."""
     loss: Loss = "nrmse"
     seed: Seed = 0
-    """Of weights, shuffles and mirrors."""
+    """Seed of weights, shuffles and mirrors."""
     fold: Annotated[int, Bounds(ge=0, le=99)] = 0
-    """Of train, for early stopping; the rest is fitted."""
-    inverse_variance_weights: bool = False
-    """Weigh each label by its inverse variance."""
+    """Fold of train for early stopping; the others are fitted."""
     label: EnergyName = "total"
     """Energy to train on: total, or net of idle power (less the idle power)."""
     extra_features: bool = False
@@ -57,21 +55,14 @@ class FitConfig(TrainConfig):
 
 @dataclass(slots=True)
 class TrainingTimes:
-    """Where the time of training went [s], of this process."""
+    """Time of training in this process [s], and the samples that it processed."""
 
     total_s: float = 0.0
-    feeding_s: float = 0.0
-    """Sampling, shuffling, mirroring, batching."""
     samples: int = 0
-
-    @property
-    def feeding_share(self) -> float:
-        """Return the share of the time in which the network waited for batches."""
-        return self.feeding_s / self.total_s if self.total_s else 0.0
 
 
 _SMALLEST = 1e-12
-"""Under the root, so that a perfect sample has a slope."""
+"""Added under the root [1]; without it the loss has no gradient at a perfect prediction."""
 
 
 def compute_loss_factors(loss: Loss, scale: Sequence[float]) -> Floats:
@@ -79,6 +70,6 @@ def compute_loss_factors(loss: Loss, scale: Sequence[float]) -> Floats:
     return np.array(scale, np.float32) if loss == "paper_eq4" else np.ones(len(scale), np.float32)
 
 
-def mean_loss(predicted: Any, labels: Any, factors: Any, weights: Any) -> Any:
+def mean_loss(predicted: Any, labels: Any, factors: Any) -> Any:
     """Return the loss of predictions, arrays or torch's tensors of shape (N, outputs), but for ``factors``, (outputs,)."""
-    return ((((predicted - labels) ** 2 * factors * weights).sum(1) + _SMALLEST) ** 0.5).mean()
+    return ((((predicted - labels) ** 2 * factors).sum(1) + _SMALLEST) ** 0.5).mean()

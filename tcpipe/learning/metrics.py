@@ -29,10 +29,10 @@ QUANTITIES = ("w", "v", "T", "E")
 UNITS = {"w": "W", "v": "m/s", "T": "s", "E": "J"}
 
 LEAST = {"w": 10.0, "v": 0.05, "T": 0.05, "E": 10.0}
-"""Labels below are in no percentage: 10 W is less than a Husky's drivers take at rest."""
+"""Smallest label in a MAPE, by quantity: 10 W is less than the idle power of a Husky's drivers."""
 
 LEAST_VELOCITY_MPS = 0.05
-"""A predicted velocity is never below it, so that T = d / v stays finite: slower is standing."""
+"""Smallest predicted velocity [m/s], so that T = d / v is finite."""
 
 ALL = "all"
 
@@ -42,7 +42,7 @@ Costs = Mapping[str, Array]
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Errors of some samples; None where there is nothing to average."""
+    """Errors of some samples; None without samples to average."""
 
     count: int
     rmse: float | None
@@ -50,7 +50,7 @@ class Errors:
     mape_count: int
     """Samples whose label is large enough for a percentage."""
     coverage_percent: float | None = field(default=None, metadata=ABSENT)
-    """Of the labels, by 90 % intervals; None, as the next two, where no deviation is stated."""
+    """Coverage of 90 % intervals [%]; None, as the next two, without stated deviations."""
     nll: float | None = field(default=None, metadata=ABSENT)
     """Mean negative log-likelihood, of labels in their unit."""
     crps: float | None = field(default=None, metadata=ABSENT)
@@ -59,7 +59,7 @@ class Errors:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """What is stated of predictions' errors, shape (N,) each: standard deviation, and the ends of 90 % intervals."""
+    """Stated errors of predictions, shape (N,) each: standard deviation, and the ends of 90 % intervals."""
 
     std: Array
     low: Array
@@ -83,7 +83,7 @@ def compute_errors(predicted: Array, measured: Array, least: float = 0.0, spread
 
 
 _LEAST_STD = 1e-9
-"""Of a spread: labels that are all equal have none."""
+"""Least standard deviation; labels that are all equal have none."""
 
 
 def _compute_scores(off: Array, measured: Array, spread: Spread) -> tuple[float, float, float]:
@@ -196,7 +196,7 @@ _TAILS = (0.025, 0.975)
 _NORMAL = 1.959964
 
 FEWEST_GROUPS = 10
-"""Groups without which a ratio has no interval: a bootstrap of fewer misses the truth too often."""
+"""Fewest groups for the interval of a ratio: a bootstrap of fewer is overconfident."""
 
 
 @dataclass(frozen=True, slots=True)

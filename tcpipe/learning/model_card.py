@@ -1,31 +1,28 @@
-"""The card of a model: ``model.json`` with inputs, outputs, training range, training and errors, and ``MODEL.md`` for people."""
+"""The card of a model, ``model.json``: inputs, outputs, training range and training."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 from numpy.typing import NDArray
 
-from tcpipe.dataset.energies import ENERGIES, EnergyName
+from tcpipe.dataset.energies import EnergyName
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
-from tcpipe.errors import clean_line
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.maps.map_facts import Description, read_layers
 from tcpipe.learning.fitting import FitConfig, ModelKind
-from tcpipe.learning.predictor import Inputs, find_kind
+from tcpipe.learning.predictor import Inputs
 from tcpipe.tables.facts import LEFT_OUT, PhysicsFit
 from tcpipe.terrain.layers import PAPER_LAYERS, ClassTable, TerrainClass, make_paper_layers
 
 KIND = "tcpipe model"
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """Version of model.json and the files next to it."""
 
 
@@ -89,7 +86,6 @@ class Training:
     config: FitConfig
     kind: ModelKind
     """Kind of the model: that of the options, or the one that was chosen."""
-    optimizer: str
     samples: Mapping[str, int]
     """``fitted``, and ``held out`` to stop by."""
     epochs: int
@@ -143,56 +139,3 @@ class ModelCard:
 def is_current(found: Mapping[str, Json]) -> bool:
     """Return whether a document is the card of a model of this schema."""
     return found.get("kind") == KIND and found.get("schema_version") == SCHEMA_VERSION
-
-
-_README = """# Terrain-cost model
-
-Predicts {{ outputs }} of {{ chord }} m of ground ahead of the robot from a patch of map:
-mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{ chord }} m.
-
-- Takes float32 (N, {{ px }}, {{ px }}, {{ depth }}) in [0, 1]: {{ channels }}; a patch is {{ patch }} m wide, travel to the right.
-{% if extra_features -%}
-- Also takes: {{ extra_features }}.
-{% endif -%}
-- Velocity is the {{ velocity }} one; power is {{ energy }}; robot {{ robot }}.
-{%- if includes %}
-  The measured power also feeds {{ includes }}.
-{%- endif %}
-- Kind {{ told.kind }}: {{ about }}.
-  Best {{ told.best_epoch }} of {{ told.epochs }} epochs or trees.
-  The loss {{ config.loss }} of {{ told.samples["held out"] }} samples that were held out is {{ "%.4f" | format(told.held_out_loss) }}.
-- Trained on {{ told.samples["fitted"] }} samples of {{ dataset.name }}, checksum {{ dataset.sha256 }}.
-- Training range: {{ classes }}; slope {{ slope }}; relief of a patch {{ relief }}. Do not use the model outside of these ranges.
-
-```python
-from tcpipe.learning.models import load_model
-
-load_model("model").predict(patches)
-```
-"""
-
-
-def format_readme(card: ModelCard) -> str:
-    """Return the text of MODEL.md, the model card for people."""
-    names = {entry.id: entry.name for entry in card.classes}
-    counts = (
-        f"{_escape_markdown(str(names.get(class_id, class_id)))} {count}"
-        for class_id, count in card.training_range.class_counts.items()
-    )
-    dataset = replace(card.dataset, name=_escape_markdown(card.dataset.name))
-    return Environment(autoescape=False, undefined=StrictUndefined, keep_trailing_newline=True).from_string(_README).render(  # noqa: S701  Markdown
-        outputs=", ".join(card.inputs.outputs), chord=f"{card.chord_m:g}", px=card.inputs.patch_px,
-        depth=len(card.inputs.planes), channels=", ".join(card.inputs.channels), patch=f"{card.inputs.patch_m:g}",
-        velocity=card.label_velocity, energy=ENERGIES[card.label_energy].words,
-        extra_features=", ".join(f"{feature.name} (usually {feature.usual:.3g})" for feature in card.inputs.extra_features),
-        includes="; ".join(map(_escape_markdown, card.label_includes)), robot=card.robot,
-        config=card.training.config, about=find_kind(card.training.kind).about, told=card.training,
-        dataset=dataset, classes=", ".join(counts),
-        slope=" to ".join(f"{np.degrees(value):.1f}°" for value in card.training_range.ranges["slope_rad"]),
-        relief=" to ".join(f"{value:.2f} m" for value in card.training_range.ranges.get("relief_m", ())) or "not looked at",
-    )  # fmt: skip
-
-
-def _escape_markdown(name: str) -> str:
-    """Return a name as text that Markdown takes for nothing else."""
-    return re.sub(r"([\\`*_\[\]<>|#~])", r"\\\1", clean_line(name))

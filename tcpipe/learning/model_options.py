@@ -50,10 +50,6 @@ class TrainOptions:
     mirror: bool | None = option(
         None, Option("Mirror every other patch across its direction of travel.", ("--mirror/--no-mirror",), shown=True)
     )
-    inverse_variance_weights: bool = option(
-        False,
-        Option("Weigh each label by its inverse variance.", ("--inverse-variance-weights",)),
-    )
     width: int | None = option(
         None,
         Option("Filters of the first stage, a multiple of 16; 64 is ResNet-18.", kind=Range(16, 512), shown=64),
@@ -98,13 +94,6 @@ class EvaluateOptions:
     )
     seed: int = option(0, Option("Seed of the noise.", kind=SEED))
     predictor: str | None = option(None, PREDICTOR)
-    adapt: Sequence[float] | None = option(
-        None,
-        Option(
-            "With --drive: adapt MODEL to each drive, whose robot may be another, by so many first metres; evaluate the rest.",
-            kind="lengths", metavar="0,10,50",
-        ),
-    )  # fmt: skip
     drives: Sequence[str | Path] = option(
         (),
         Option(

@@ -1,13 +1,12 @@
-"""Trained models: folders that appear whole or not at all.
+"""Trained models: folders that are complete or absent.
 
 ::
 
-    model.json         what it takes, gives, and has seen; how it was trained; checksums of the rest
-    weights.npz        every weight by its path in the network; a table's curves and trees; coefficients of physics
+    model.json         inputs, outputs, training range and training; checksums of the other files
+    weights.npz        the weights of a network by torch's names; curves and trees; coefficients of physics
     residuals.parquet  labels and predictions of the fold that stopped a network; else of all samples, by the other folds
     ground.parquet     longitude and latitude of the training samples; empty without coordinates
     history.csv        losses of every epoch
-    MODEL.md           the same for people
 """
 
 from __future__ import annotations
@@ -25,13 +24,12 @@ from numpy.typing import NDArray
 from tcpipe.cost.prediction_errors import Errors, estimate_correlation, fit_errors
 from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
 from tcpipe.errors import ModelError, StoreError, UsageError
-from tcpipe.formats.atomic import write_atomic_directory, write_text
-from tcpipe.formats.dataset_files import is_shard, read_card
+from tcpipe.formats.atomic import write_text
 from tcpipe.formats.integrity import compute_checksums, read_sealed, seal_document, write_sealed
 from tcpipe.formats.json_files import digest, parse_typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.place import Place, find_wrong_files
-from tcpipe.formats.published_outputs import fetch_directory, fetch_directory_by_range
+from tcpipe.formats.published_outputs import fetch_directory, publish_directory
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
@@ -44,32 +42,31 @@ logger = logging.getLogger("tcpipe")
 Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
 
-FILES = CARD, WEIGHTS, RESIDUALS, GROUND, HISTORY, README = (
+FILES = CARD, WEIGHTS, RESIDUALS, GROUND, HISTORY = (
     "model.json",
     "weights.npz",
     "residuals.parquet",
     "ground.parquet",
     "history.csv",
-    "MODEL.md",
 )
 
 GROUND_COLUMNS = "lon_deg", "lat_deg"
 
 _SPEED_MARGIN_MPS = 0.01
-"""By which a speed that is asked for may lie beside those of training: it is rounded."""
+"""Largest distance of a speed from those of training [m/s], for rounding."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A trained network or table with its card; ``name`` is the folder as it was given."""
+    """A trained model with its card; ``name`` is the folder as it was given."""
 
     name: str
     card: ModelCard
     place: Path
     checksum: str
-    """Of card and weights: what rules its predictions."""
+    """Checksum of card and weights, which determine its predictions."""
     residuals: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
-    """Of the held-out fold, one row a sample: run_id, start_ns, terrain_class, labels, predictions."""
+    """Columns of the held-out samples: run_id, start_ns, terrain_class, labels, predictions."""
     own: OwnKind | None = None
     """The user's code."""
     ground_deg: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
@@ -77,7 +74,7 @@ class Model:
 
     @cached_property
     def predictor(self) -> Predictor:
-        """Return what predicts: a model of the card's kind, from its arrays; torch is imported for a network."""
+        """Return the model of the card's kind from its arrays; torch is imported for a network."""
         path = self.place / WEIGHTS
         kind = find_kind(self.card.training.kind) if self.own is None else self.own.kind
         try:
@@ -90,12 +87,12 @@ class Model:
 
     @property
     def takes_turns(self) -> bool:
-        """Whether it is told how far a metre turns, and its predictions hold what that costs."""
+        """Whether the turn of a metre is an input, so that predictions include its cost."""
         return any(feature.name == "turn_radpm" for feature in self.card.inputs.extra_features)
 
     @cached_property
     def errors(self) -> dict[str, Errors] | None:
-        """What held-out samples show of its errors; None of too few."""
+        """Return the errors on held-out samples; None if they are too few."""
         return fit_errors(self.residuals)
 
     def find_near(self, lonlat_deg: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -131,7 +128,7 @@ class Model:
     def predict(self, patches: Floats, features: ExtraFeatures | None = None) -> Prediction:
         """Return power [W] and velocity [m/s] of patches as `ask`, with the covariances of their errors on new ground.
 
-        They rest on held-out predictions: what the model states is scaled by these, and stands beside what they show in any case.
+        The covariances come from held-out predictions, which also scale those that the model states.
         """
         said, errors = self.ask(patches, features), self.errors
         if errors is None or said.mean.shape[1] != 2:
@@ -148,15 +145,14 @@ class Model:
 
 
 def write_model(
-    place: Path, *, card: ModelCard, weights: Arrays, residuals: pa.Table, ground: pa.Table, history: str, readme: str
+    out: str | Path, *, card: ModelCard, weights: Arrays, residuals: pa.Table, ground: pa.Table, history: str
 ) -> None:
-    """Write the folder, whole or not at all."""
-    with write_atomic_directory(place) as directory:
+    """Write a model folder, or the newest build at a URL, complete or not at all."""
+    with publish_directory(out, CARD) as directory:
         write_arrays(directory / WEIGHTS, weights)
         write_table(residuals, directory / RESIDUALS)
         write_table(ground, directory / GROUND)
         write_text(directory / HISTORY, history)
-        write_text(directory / README, readme)
         write_sealed(directory / CARD, replace(card, checksums=compute_checksums(directory)))
 
 
@@ -166,7 +162,7 @@ def load_model(path: str | Path, predictor: str | None = None) -> Model:
     Parameters
     ----------
     path : its folder, or the URL of one in a bucket.
-    predictor : ``FILE.py[:NAME]`` or entry point of the code of a model that was trained with one; it is run.
+    predictor : ``FILE.py[:NAME]``, the code of a model that was trained with one; it is run.
 
     Raises
     ------
@@ -203,16 +199,9 @@ def _add_code(model: Model, predictor: str | None) -> Model:
     return replace(model, own=own, checksum=digest([model.checksum, own.digest]))
 
 
-def choose_model(
-    path: str | Path,
-    *,
-    physics: str | Path | None = None,
-    speed_mps: float | None = None,
-    predictor: str | None = None,
-) -> Model:
-    """Return a model as `load_model`, with the physics of a dataset and asked for a commanded speed [m/s] where these are given."""
+def choose_model(path: str | Path, *, speed_mps: float | None = None, predictor: str | None = None) -> Model:
+    """Return a model as `load_model`, asked for a commanded speed [m/s] if one is given."""
     model = load_model(path, predictor)
-    model = model if physics is None else set_physics(model, physics)
     return model if speed_mps is None else set_speed(model, speed_mps)
 
 
@@ -236,21 +225,8 @@ def set_speed(model: Model, speed_mps: float) -> Model:
     return replace(model, card=card, checksum=digest([model.checksum, speed_mps]))
 
 
-def set_physics(model: Model, dataset: str | Path) -> Model:
-    """Return the model with the physics of its robot that a dataset's card holds, instead of its own; `ModelError` if it holds none."""
-    if model.takes_turns:
-        raise UsageError(f"{model.name}: already includes the cost of turns; remove --physics-from")
-    card = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])
-    if model.card.robot not in card.physics:
-        raise ModelError(
-            f"{dataset}: its card has no physics of robot {model.card.robot}; only of {', '.join(card.physics) or 'none'}"
-        )
-    own = replace(model.card, physics=card.physics[model.card.robot])
-    return replace(model, card=own, checksum=digest([model.checksum, own.physics]))
-
-
 def read_model_card(place: Path) -> ModelCard:
-    """Return model.json of a folder; `UsageError` where there is none, `ModelError` where it is damaged or of another schema."""
+    """Return model.json of a folder; `UsageError` without one, `ModelError` if it is damaged or of another schema."""
     if not place.is_dir():
         raise UsageError(f"{place}: there is no such model; run 'tcpipe train' first")
     where = place / CARD

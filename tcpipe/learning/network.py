@@ -29,13 +29,10 @@ Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
 
 _TOGETHER = 256
+"""Patches in one forward pass."""
 
-_CUT_DEVIATION = 0.87962566103423978
-"""Standard deviation of a normal variable of deviation one that is cut at two, by which Keras's ``he_normal`` is widened again."""
-
-_FILED = {"weight": "kernel", "bias": "bias"}
-_FILED_NORM = {"weight": "gamma", "bias": "beta", "running_mean": "moving_mean", "running_var": "moving_variance"}
-"""Names of weights in torch, and in a file, as Keras has them."""
+_TRUNCATED_STD = 0.87962566103423978
+"""Standard deviation of a standard normal variable that is truncated at ±2; Keras's ``he_normal`` divides by it."""
 
 
 class Normed(nn.Module):
@@ -101,8 +98,8 @@ class ResNet18(nn.Module):
         return out
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """Return a copy of every weight by its name in a file; kernels have the shape (rows, columns, channels in, channels out)."""
-        return {name: value.numpy(force=True).copy() for name, value in self._list_weights().items()}
+        """Return a copy of every weight by torch's name."""
+        return {name: value.numpy(force=True).copy(order="C") for name, value in self._list_weights().items()}
 
     @classmethod
     def from_arrays(cls, depth: int, outputs: int, width: int, *, arrays: Arrays) -> ResNet18:
@@ -113,7 +110,7 @@ class ResNet18(nn.Module):
         return network
 
     def load(self, arrays: Arrays) -> None:
-        """Put weights in, on the device that there is; `ModelError` if they are another network's."""
+        """Set the weights and move to the device; `ModelError` if they are another network's."""
         forms = {name: ("float32", tuple(value.shape)) for name, value in self._list_weights().items()}
         check_arrays(arrays, forms)
         self.to_empty(device=find_device())
@@ -122,9 +119,8 @@ class ResNet18(nn.Module):
             value.copy_(torch.from_numpy(np.ascontiguousarray(arrays[name])))
 
     def _list_weights(self) -> dict[str, Any]:
-        """Return a view of every weight, without the count of batches that no fixed share asks for."""
-        own = {name: weight for name, weight in self.state_dict().items() if not name.endswith("num_batches_tracked")}
-        return {_make_weight_name(name): _reorder_axes(value) for name, value in own.items()}
+        """Return every weight without the count of batches, which a fixed momentum does not need."""
+        return {name: weight for name, weight in self.state_dict().items() if not name.endswith("num_batches_tracked")}
 
 
 def make_resnet18(depth: int, outputs: int, width: int, *, seed: int, start: Sequence[float]) -> ResNet18:
@@ -132,7 +128,7 @@ def make_resnet18(depth: int, outputs: int, width: int, *, seed: int, start: Seq
     network, drawn = ResNet18(depth, outputs, width), torch.Generator().manual_seed(seed)
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d):
-            deviation = math.sqrt(2.0 / layer.weight[0].numel()) / _CUT_DEVIATION
+            deviation = math.sqrt(2.0 / layer.weight[0].numel()) / _TRUNCATED_STD
             nn.init.trunc_normal_(layer.weight, 0.0, deviation, -2.0 * deviation, 2.0 * deviation, generator=drawn)
     nn.init.normal_(network.head.weight, 0.0, 0.01, generator=drawn)
     network.head.bias.data[:] = torch.tensor(list(start))
@@ -162,22 +158,11 @@ def _pad_images(images: Any, size: int, stride: int) -> Any:
     return functional.pad(images, [part for pixels in missing for part in (pixels // 2, pixels - pixels // 2)])
 
 
-def _make_weight_name(name: str) -> str:
-    """Return a weight's name in a file."""
-    layer, _, kind = name.rpartition(".")
-    return f"{layer.replace('.', '_')}/{(_FILED_NORM if layer.endswith('norm') else _FILED)[kind]}"
-
-
-def _reorder_axes(value: Any) -> Any:
-    """Return a view with the axes that a file has: outputs last."""
-    return value.permute(2, 3, 1, 0) if value.ndim == 4 else value.T if value.ndim == 2 else value
-
-
 _DIGEST_BYTES = 32
 """Size of the SHA-256 before a packed state [byte]."""
 
 _EPSILON = 1e-7
-"""Epsilon of Adam, as Keras has it; torch's own is 1e-8."""
+"""Epsilon of Adam [1]: that of Keras; torch's default is 1e-8."""
 
 
 class Trainer:
@@ -214,16 +199,14 @@ class Trainer:
         """Return a copy of every weight by torch's name."""
         return {name: value.clone() for name, value in self.network.state_dict().items()}
 
-    def step(self, patches: Floats, labels: Floats, weights: Floats, learning_rate: float) -> float:
-        """Train on a batch, patches (N, px, px, depth), labels and weights (N, outputs); return its mean loss."""
-        if (
-            len(patches) == 1
-        ):  # of a single pixel torch has no deviation; twice the same sample has the same mean and gradient
-            patches, labels, weights = (np.repeat(values, 2, axis=0) for values in (patches, labels, weights))
+    def step(self, patches: Floats, labels: Floats, learning_rate: float) -> float:
+        """Train on a batch, patches (N, px, px, depth) and labels (N, outputs); return its mean loss."""
+        if len(patches) == 1:  # batch normalisation needs two values; a repeated sample has the same mean and gradient
+            patches, labels = (np.repeat(values, 2, axis=0) for values in (patches, labels))
         self.optimizer.param_groups[0]["lr"] = learning_rate
         self.network.train()
-        wanted, weigh = (torch.from_numpy(values).to(find_device()) for values in (labels, weights))
-        loss = mean_loss(self.network(move_to_device(patches)), wanted, self._factors, weigh)
+        wanted = torch.from_numpy(labels).to(find_device())
+        loss = mean_loss(self.network(move_to_device(patches)), wanted, self._factors)
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()

@@ -90,17 +90,13 @@ class _State:
     progress: TrainingProgress
     best: dict[str, Any]
     """Weights of the best epoch."""
-    held_out: NDArray[np.float64]
-    """Predictions of samples that were held out, shape (N, outputs); NaN where there is none yet."""
-
     packed: bytes = b""
     """The state at the end of the last epoch."""
     written_s: float = float("-inf")
 
     def keep(self, path: Path) -> None:
         """Pack the state; write it if the last one was written long ago."""
-        parts = {"progress": asdict(self.progress), "best": self.best, "held_out": self.held_out.tolist()}
-        self.packed = self.trainer.pack_state(parts)
+        self.packed = self.trainer.pack_state({"progress": asdict(self.progress), "best": self.best})
         if time.monotonic() - self.written_s > _SECONDS_BETWEEN:
             self.write(path)
 
@@ -114,7 +110,6 @@ class _State:
         """Continue from a file of `write`; `ModelError` where it is damaged."""
         parts = self.trainer.read_state(path)
         self.progress, self.best = TrainingProgress(**parts["progress"]), parts["best"]
-        self.held_out = np.array(parts["held_out"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,11 +119,6 @@ class NetworkModel(Predictor):
     network: ResNet18
     inputs: Inputs
 
-    about: ClassVar[str] = (
-        "ResNet-18, stopped by one fold of train, on whose errors its intervals rest, 1.22 times as wide for what folds differ; "
-        "with train.cross_fit they rest on those of networks without each fold"
-    )
-    optimizer: ClassVar[str] = "Adam"
     stops_by_fold: ClassVar[bool] = True
 
     def predict(self, patches: Floats, features: ExtraFeatures) -> Floats:
@@ -143,7 +133,7 @@ class NetworkModel(Predictor):
     @classmethod
     def from_arrays(cls, arrays: Arrays, inputs: Inputs) -> NetworkModel:
         """Return the network with these weights; its width is that of the first ones."""
-        sizes = inputs.depth, len(inputs.outputs), arrays.get("stem_convolution/kernel", np.empty(0)).shape[-1]
+        sizes = inputs.depth, len(inputs.outputs), arrays.get("stem.convolution.weight", np.empty(1)).shape[0]
         check_trainable(*sizes)
         from tcpipe.learning.network import ResNet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
 
@@ -156,11 +146,11 @@ class NetworkModel(Predictor):
         ``job.checkpoint``, from which training continues, is the state at the end of an epoch. It is written before the first epoch, when
         training is interrupted, and every `_SECONDS_BETWEEN`.
         """
-        config, is_held = samples.config, samples.folds == samples.config.fold
+        is_held = samples.folds == samples.config.fold
         fit, held = samples.take(~is_held), samples.take(is_held)
         trainer, device = _make_trainer(fit)
         model, times = cls(trainer.network, samples.inputs), TrainingTimes()
-        state = _State(trainer, TrainingProgress(), trainer.copy_weights(), np.full(samples.labels.shape, np.nan))
+        state = _State(trainer, TrainingProgress(), trainer.copy_weights())
         logger.info("%s: %d samples to fit, %d to stop by, on %s", job.name, len(fit), len(held), device)
         if job.checkpoint.exists():
             state.read(job.checkpoint)
@@ -168,22 +158,14 @@ class NetworkModel(Predictor):
         state.keep(job.checkpoint)  # a place that cannot be written is found now, not after an epoch
         try:
             cls._fit_until_best(model, state, fit, held, job, times)
-            trainer.network.load_state_dict(state.best)
-            state.held_out[is_held] = predict_samples(model, held).mean
-            for fold in np.unique(samples.folds) if config.cross_fit else ():
-                rows = samples.folds == fold
-                if np.isnan(state.held_out[rows]).any():
-                    logger.info("%s: a network without fold %d, for intervals", job.name, fold)
-                    other = cls._fit_best_epochs(samples.take(~rows), state.progress, times)
-                    state.held_out[rows] = predict_samples(other, samples.take(rows)).mean
-                    state.keep(job.checkpoint)
-            state.keep(job.checkpoint)
-            state.write(job.checkpoint)  # what uses the network may fail
+            state.write(job.checkpoint)  # later steps may fail
         except BaseException as error:
             if not isinstance(error, Exception):  # the user, or a signal
                 state.write(job.checkpoint)
             raise
-        progress, held_out = state.progress, Prediction.without_covariance(state.held_out)
+        trainer.network.load_state_dict(state.best)
+        progress, held_out = state.progress, Prediction.without_covariance(np.full(samples.labels.shape, np.nan))
+        held_out.mean[is_held] = predict_samples(model, held).mean
         return Fitted(model, held_out, progress.epoch, progress.best_epoch, progress.history, times, device)
 
     @classmethod
@@ -203,39 +185,25 @@ class NetworkModel(Predictor):
             state.keep(job.checkpoint)
             _log_epoch(job.name, progress, config, times)
 
-    @classmethod
-    def _fit_best_epochs(cls, fit: Samples, like: TrainingProgress, times: TrainingTimes) -> NetworkModel:
-        """Return a network of other samples after as many epochs as were best, at the same rates."""
-        trainer, _ = _make_trainer(fit)
-        for epoch in range(like.best_epoch):
-            cls._train_epoch(trainer, fit, TrainingProgress(epoch=epoch, history=like.history[:epoch]), times)
-        return cls(trainer.network, fit.inputs)
-
     @staticmethod
-    def iterate_batches(fit: Samples, epoch: int) -> Iterator[tuple[Floats, Floats, Floats]]:
-        """Yield patches (N, px, px, depth), labels and weights (N, outputs) of every sample once."""
+    def iterate_batches(fit: Samples, epoch: int) -> Iterator[tuple[Floats, Floats]]:
+        """Yield patches (N, px, px, depth) and labels (N, outputs) of every sample once."""
         config, inputs = fit.config, fit.inputs
         rules: dict[str, Any] = {"features": COLUMNS} if inputs.extra_features else {}
-        batches = fit.split.batches(
-            config.batch_size, shuffle=True, seed=config.seed, mirror=config.mirror, weights=config.inverse_variance_weights, **rules
-        )  # fmt: skip
+        batches = fit.split.batches(config.batch_size, shuffle=True, seed=config.seed, mirror=config.mirror, **rules)
         feed: Iterator[Any] = batches.epoch(epoch)
-        for patches, labels, *weights in feed:
+        for patches, labels in feed:
             planes = append_column_planes(inputs.extra_features, *patches) if inputs.extra_features else patches
-            yield planes, labels, weights[0] if weights else np.ones_like(labels)
+            yield planes, labels
 
     @classmethod
     def _train_epoch(cls, trainer: Trainer, fit: Samples, progress: TrainingProgress, times: TrainingTimes) -> float:
         """Train on every sample once; return the mean loss."""
         scale, rate = np.array(fit.inputs.scale, np.float32), compute_learning_rate(fit.config, progress)
         total, count, began = 0.0, 0, time.perf_counter()
-        feed, asked = cls.iterate_batches(fit, progress.epoch), began
-        while (batch := next(feed, None)) is not None:
-            patches, labels, weights = batch
-            times.feeding_s += time.perf_counter() - asked
-            total += trainer.step(patches, labels / scale, weights, rate) * len(patches)
+        for patches, labels in cls.iterate_batches(fit, progress.epoch):
+            total += trainer.step(patches, labels / scale, rate) * len(patches)
             count += len(patches)
-            asked = time.perf_counter()
         times.total_s += time.perf_counter() - began
         times.samples += count
         if not np.isfinite(total):
@@ -275,7 +243,7 @@ def compute_learning_rate(config: FitConfig, progress: TrainingProgress) -> floa
 def _log_epoch(name: str, progress: TrainingProgress, config: FitConfig, times: TrainingTimes) -> None:
     epoch, loss, held = progress.history[-1]
     logger.info(
-        "%s: epoch %d of at most %d: loss %.4f, held-out fold %.4f (best %.4f in epoch %d); %.0f samples/s, %.1f %% of the time feeding",
+        "%s: epoch %d of at most %d: loss %.4f, held-out fold %.4f (best %.4f in epoch %d); %.0f samples/s",
         name, epoch, config.epochs, loss, held, progress.best_loss, progress.best_epoch,
-        times.samples / max(times.total_s, 1e-9), 100.0 * times.feeding_share,
+        times.samples / max(times.total_s, 1e-9),
     )  # fmt: skip

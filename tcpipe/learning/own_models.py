@@ -1,6 +1,6 @@
-"""Models of the user's own code, loaded only where a command names them: a class or a function in a file, or an entry point.
+"""Models of the user's own code, loaded only where a command names them: a class or a function in a file.
 
-A folder of a model never names code; it has arrays, and the digest of the code that made them.
+A model folder never names code; it contains arrays, and the digest of the code that made them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -23,9 +22,6 @@ from tcpipe.learning.predictor import Predictor
 
 logger = logging.getLogger("tcpipe")
 
-GROUP = "tcpipe.predictors"
-"""Group of entry points of packages that bring models."""
-
 
 @dataclass(frozen=True, slots=True)
 class OwnKind:
@@ -34,39 +30,22 @@ class OwnKind:
     source: str
     """As the user gave it."""
     digest: str
-    """Of the file's bytes; of a package its name and version."""
+    """SHA-256 of the file."""
     kind: type[Predictor]
 
 
 def load_own_kind(source: str) -> OwnKind:
-    """Return the kind of model that ``FILE.py``, ``FILE.py:NAME`` or the name of an entry point stands for; this runs its code."""
-    path, name = source, ""
-    if not source.endswith(".py") and ".py:" in source:
-        path, _, name = source.rpartition(":")
-    if path.endswith(".py"):
-        return _load_file(source, Path(path), name)
-    points = {point.name: point for point in entry_points(group=GROUP)}
-    if source not in points:
-        found = ", ".join(sorted(points)) or "none"
-        raise UsageError(
-            f"--predictor {source}: no such entry point of group {GROUP} (there are: {found}); give one, or FILE.py[:NAME]"
-        )
-    point = points[source]
-    with report_errors(source):
-        found = point.load()
-    digest = f"{point.dist.name} {point.dist.version}" if point.dist is not None else point.value
-    return OwnKind(source, digest, _make_kind(found, source))
-
-
-def _load_file(source: str, path: Path, name: str) -> OwnKind:
+    """Return the kind of model in ``FILE.py`` or ``FILE.py:NAME``; this runs its code."""
+    file, _, name = source.rpartition(":") if ".py:" in source else (source, "", "")
+    path = Path(file)
     if not path.is_file():
-        raise UsageError(f"--predictor {source}: there is no file {path}")
+        raise UsageError(f"--predictor {source}: there is no file {path}; expected FILE.py[:NAME]")
     code = path.read_bytes()
     digest = hashlib.sha256(code).hexdigest()
     module = ModuleType(f"tcpipe_own_{digest[:16]}")
     module.__file__ = str(path.resolve())
     sys.modules[module.__name__] = module  # dataclasses look for their module there
-    # Bytecode in a cache may be of an earlier file: what runs is what the digest is of.
+    # Cached bytecode may be of an earlier file: run the bytes of the digest.
     with report_errors(source):
         exec(compile(code, module.__file__, "exec"), vars(module))  # noqa: S102  the user names this file
     own = {key: item for key, item in vars(module).items() if getattr(item, "__module__", "") == module.__name__}

@@ -1,16 +1,14 @@
-"""A model of a few coefficients: how fast the robot drives a slope of a class, and what physics says that takes (`tcpipe.cost.physics`).
+"""Models of few coefficients: curves over the slope for each terrain class, and the physics of power (`tcpipe.cost.physics`).
 
-Curves over the slope, one a terrain class: the model of a metre's cost with the fewest parameters.
-
-A curve is a sum of few functions of the slope; its numbers are found by least squares, in closed form. Where a class has few samples its
-curve lies near that of all ground: the difference counts as if as many samples as it has numbers had told that there is none.
+A curve is a polyline over the slope, fitted by least squares. The curve of a class with few samples stays near that of all ground: the
+difference between them is penalised as if as many samples as a curve has coefficients had shown none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +31,6 @@ _CLASSES = 256
 class PhysicsModel(Predictor):
     """P = P0 + D v / cos(s) + g(F v + N v tan(s) + M v |turn|), and v as a curve over the slope s."""
 
-    about: ClassVar[str] = (
-        "physics of idle power, drivetrain, grade, and rolling and turning of each class, at a speed that is a curve over class and slope; "
-        "fitted robustly. Of a patch it takes slope and class, which `predict` takes as features"
-    )
-    optimizer: ClassVar[str] = "robust least squares"
     channels: ClassVar[tuple[str, ...]] = ("height",)
     features: ClassVar[tuple[str, ...] | None] = ("turn_radpm",)
 
@@ -84,7 +77,7 @@ class PhysicsModel(Predictor):
         """Return the model of these arrays."""
         del inputs
         check_arrays(arrays, {**_FORMS, **list_curve_arrays(1)})
-        speed, rest = read_curves("linear", arrays)
+        speed, rest = read_curves(arrays)
         if not all(np.isfinite(values).all() for values in rest.values()):
             raise ModelError("contains coefficients that are not finite; train the model again")
         return cls(speed, **rest)
@@ -117,7 +110,7 @@ def fit_physics_model(extra_features: ExtraFeatures, labels: Floats, *, idle_wat
         raise ModelError(f"{len(labels)} samples to fit physics to, expected at least {FEWEST} that move")
     known = extra_features.turn_radpm[np.isfinite(extra_features.turn_radpm)]
     return PhysicsModel(
-        speed=fit_curves("linear", extra_features.slope_rad, extra_features.class_id, labels[:, 1:]),
+        speed=fit_curves(extra_features.slope_rad, extra_features.class_id, labels[:, 1:]),
         no_load_watt=_evaluate_all(found, "idle"),
         drivetrain_newton=_evaluate_all(found, "drivetrain"),
         grade_newton=_evaluate_all(found, "grade"),
@@ -148,22 +141,16 @@ def _collect_by_class(found: Physics, term: str) -> Floats:
     return np.array([own.get(str(class_id), rest) for class_id in range(_CLASSES)])
 
 
-Form: TypeAlias = Literal["mean", "linear", "spline"]
-
-_KNOTS: dict[Form, tuple[float, ...]] = {
-    "mean": (), "linear": (1 / 3, 2 / 3), "spline": (0.05, 0.23, 0.41, 0.59, 0.77, 0.95),
-}  # fmt: skip
-"""Quantiles of the slopes: a straight line in each third, of four numbers, and six knots, of six.
-
-Those of the spline are Harrell's (Regression Modeling Strategies, 2015, 2.4.6)."""
+_KNOTS = 1 / 3, 2 / 3
+"""Quantiles of the slopes where a curve bends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Curves:
     """Fitted curves, as arrays."""
 
-    form: Form
     knots_rad: Floats
+    """Slopes where the curves bend; none: a mean of each class."""
     pooled: Floats
     """Coefficients of all ground, and of unknown classes, shape (J, outputs)."""
     class_id: NDArray[np.int64]
@@ -172,18 +159,18 @@ class Curves:
 
     def predict(self, slope_rad: Floats, class_id: NDArray[np.int64]) -> Floats:
         """Return outputs, shape (N, outputs), of metres of ground."""
-        made = _evaluate_functions(self.form, self.knots_rad, slope_rad)
+        made = _evaluate_functions(self.knots_rad, slope_rad)
         out = made @ self.pooled
         for known, numbers in zip(self.class_id.tolist(), self.own, strict=True):
             out[class_id == known] = made[class_id == known] @ numbers
         return out
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return everything but the form by name, as `read_curves` takes it."""
+        """Return the arrays by name, as `read_curves` takes them."""
         return {f"{_STORED}{name}": getattr(self, name) for name in _ARRAYS}
 
 
-_MOST_KNOTS, _MOST_CLASSES = 6, 256
+_MOST_KNOTS, _MOST_CLASSES = 2, 256
 _ARRAYS, _STORED = ("knots_rad", "pooled", "class_id", "own"), "curve_"
 
 
@@ -198,15 +185,14 @@ def list_curve_arrays(outputs: int) -> dict[str, ArrayForm]:
     return {f"{_STORED}{name}": form for name, form in forms.items()}
 
 
-def read_curves(form: Form, arrays: Mapping[str, NDArray[Any]]) -> tuple[Curves, dict[str, NDArray[Any]]]:
+def read_curves(arrays: Mapping[str, NDArray[Any]]) -> tuple[Curves, dict[str, NDArray[Any]]]:
     """Return the curves of `Curves.arrays` and the other arrays; `ModelError` without valid curves."""
     rest = dict(arrays)
-    curves = Curves(form, *(rest.pop(f"{_STORED}{name}") for name in _ARRAYS))
-    functions = (
-        _evaluate_functions(form, curves.knots_rad, np.zeros(1)).shape[1] if curves.knots_rad.size <= _MOST_KNOTS else 0
-    )
+    curves = Curves(*(rest.pop(f"{_STORED}{name}") for name in _ARRAYS))
+    functions = _evaluate_functions(curves.knots_rad[: _MOST_KNOTS + 1], np.zeros(1)).shape[1]
+    is_plausible = curves.knots_rad.size <= _MOST_KNOTS and len(curves.class_id) <= _MOST_CLASSES
     finite = all(np.isfinite(values).all() for values in (curves.knots_rad, curves.pooled, curves.own))
-    if len(curves.pooled) != functions or not finite or len(curves.class_id) > _MOST_CLASSES:
+    if len(curves.pooled) != functions or not finite or not is_plausible:
         raise ModelError("contains curves that no training makes; train the model again")
     return curves, rest
 
@@ -214,11 +200,9 @@ def read_curves(form: Form, arrays: Mapping[str, NDArray[Any]]) -> tuple[Curves,
 class CurveModel(Predictor):
     """Power and velocity by class and slope alone."""
 
-    about: ClassVar[str] = "a curve over the slope of each terrain class, nothing else of the patch"
-    optimizer: ClassVar[str] = "least squares"
     channels: ClassVar[tuple[str, ...]] = ("height",)
     features: ClassVar[tuple[str, ...] | None] = ()
-    form: ClassVar[Form] = "linear"
+    quantiles: ClassVar[tuple[float, ...]] = _KNOTS
 
     def __init__(self, curves: Curves) -> None:
         self.curves = curves
@@ -231,7 +215,8 @@ class CurveModel(Predictor):
     @classmethod
     def fit(cls, samples: Samples) -> CurveModel:
         """Fit a curve of every class."""
-        return cls(fit_curves(cls.form, samples.features.slope_rad, samples.features.class_id, samples.labels))
+        of = samples.features
+        return cls(fit_curves(of.slope_rad, of.class_id, samples.labels, quantiles=cls.quantiles))
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return the curves by name."""
@@ -241,33 +226,28 @@ class CurveModel(Predictor):
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> CurveModel:
         """Return the model of these curves."""
         check_arrays(arrays, list_curve_arrays(len(inputs.outputs)))
-        return cls(read_curves(cls.form, arrays)[0])
+        return cls(read_curves(arrays)[0])
 
 
 class MeanModel(CurveModel):
     """A mean of each class."""
 
-    about: ClassVar[str] = "the mean of each terrain class"
-    form: ClassVar[Form] = "mean"
+    quantiles: ClassVar[tuple[float, ...]] = ()
 
 
-class SplineModel(CurveModel):
-    """A natural cubic spline of each class."""
-
-    form: ClassVar[Form] = "spline"
-
-
-def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], labels: Floats) -> Curves:
+def fit_curves(
+    slope_rad: Floats, class_id: NDArray[np.int64], labels: Floats, *, quantiles: Sequence[float] = _KNOTS
+) -> Curves:
     """Fit a curve of every class.
 
     Parameters
     ----------
-    form : ``mean``: one number; ``linear``: straight in each third of the slopes; ``spline``: natural cubic.
     slope_rad, class_id : of the samples, finite, shape (N,), N at least 1.
     labels : finite, shape (N, outputs).
+    quantiles : of the slopes, where the curves bend; none: a mean of each class.
     """
-    knots = np.unique(np.quantile(slope_rad, _KNOTS[form])) if _KNOTS[form] else np.empty(0)
-    made = _evaluate_functions(form, knots, slope_rad)
+    knots = np.unique(np.quantile(slope_rad, quantiles)) if quantiles else np.empty(0)
+    made = _evaluate_functions(knots, slope_rad)
     pooled = np.asarray(np.linalg.lstsq(made, labels, rcond=None)[0], np.float64)
     drawn = made.T @ made * (made.shape[1] / len(made))
     classes = np.unique(class_id[class_id > 0])
@@ -275,7 +255,7 @@ def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], label
     for at, known in enumerate(classes):
         mine, off = made[class_id == known], (labels - made @ pooled)[class_id == known]
         own[at] = pooled + np.linalg.pinv(mine.T @ mine + drawn, hermitian=True) @ (mine.T @ off)
-    return Curves(form, knots, pooled, classes, own)
+    return Curves(knots, pooled, classes, own)
 
 
 def cross_fit_curves(
@@ -285,22 +265,16 @@ def cross_fit_curves(
     out = np.empty_like(labels)
     for fold in np.unique(folds):
         held = folds == fold
-        others = fit_curves("linear", slope_rad[~held], class_id[~held], labels[~held])
+        others = fit_curves(slope_rad[~held], class_id[~held], labels[~held])
         out[held] = others.predict(slope_rad[held], class_id[held])
     return out
 
 
-def _evaluate_functions(form: Form, knots_rad: Floats, slope_rad: Floats) -> Floats:
-    """Return the functions of a form at these slopes, shape (N, J); all of order one, so that none is lost beside another."""
+def _evaluate_functions(knots_rad: Floats, slope_rad: Floats) -> Floats:
+    """Return the functions of a curve at these slopes, shape (N, J), all of order one so that none is lost by rounding."""
     one = np.ones_like(slope_rad)
-    if form == "mean" or not knots_rad.size:
+    if not knots_rad.size:
         return one[:, None]
     width = max(float(np.ptp(knots_rad)), 1e-6)
     slope, knots = (slope_rad - knots_rad[0]) / width, (knots_rad - knots_rad[0]) / width
-    beyond = np.maximum(slope[:, None] - knots, 0.0)
-    if form == "linear" or knots.size < 3:
-        return np.column_stack([one, slope, beyond])
-    cubes = beyond**3  # natural: what bends beyond the last knot is taken out (Harrell, eq. 2.25)
-    last = knots[-1] - knots[-2]
-    bent = cubes[:, :-2] - np.outer(cubes[:, -2], knots[-1] - knots[:-2]) / last
-    return np.column_stack([one, slope, bent + np.outer(cubes[:, -1], knots[-2] - knots[:-2]) / last])
+    return np.column_stack([one, slope, np.maximum(slope[:, None] - knots, 0.0)])

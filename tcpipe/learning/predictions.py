@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from tcpipe.cost.prediction_errors import COVERAGE, Residuals, fit_bias_correction, propagate_stated
 from tcpipe.dataset import Dataset, Split
@@ -25,7 +24,7 @@ from tcpipe.tables.columns import Column, to_floats, to_texts
 from tcpipe.terrain.layers import ClassTable
 
 CALLED = {"w": "power", "v": "velocity", "T": "duration", "E": "energy"}
-"""What columns of tables call the quantities."""
+"""Names of the quantities in columns of tables."""
 
 _UNKNOWN = (0, "unknown")
 
@@ -38,10 +37,10 @@ class Measured:
     costs: Mapping[str, Array]
     deviations: Mapping[str, Array]
     own_deviations: Mapping[str, Array]
-    """Without the part that all labels of a run share: a model of labels of one sensor learns that part."""
+    """Standard deviations without the error that all labels of a run share, which a model learns."""
     class_ids: NDArray[np.int64]
     names: Mapping[int, str]
-    """Of the classes that occur, by id."""
+    """Names of the classes that occur, by id."""
 
 
 def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
@@ -170,9 +169,6 @@ _KEYS = (
     Column("slope_rad", pa.float64(), "rad", "slope along travel, uphill positive", nullable=True),
 )
 
-LEVELS = np.linspace(0.02, 0.98, 49)
-"""Quantiles that predictions are held to."""
-
 
 def make_column_name(quantity: str, part: str = "") -> str:
     """Return the name of the column that holds a part of w, v, T or E, as ``energy_predicted_low_joule``."""
@@ -182,7 +178,7 @@ def make_column_name(quantity: str, part: str = "") -> str:
 def make_predictions_table(
     sets: Mapping[str, Measured], said: Mapping[str, Mapping[str, Array]], spreads: Mapping[str, Mapping[str, Spread]]
 ) -> pa.Table:
-    """Return one row a labelled sample: what was measured, what a model said, and how sure it was; null where it did not say."""
+    """Return one row a labelled sample: label, prediction and stated errors; null without a prediction."""
     fields = [column.field() for column in _KEYS]
     fields += [
         Column(make_column_name(q, part), pa.float64(), UNITS[q], doc, nullable=True).field()
@@ -237,15 +233,3 @@ def find_worst_rows(table: pa.Table, count: int) -> NDArray[np.int64]:
         rows = np.flatnonzero((split == name) & np.isfinite(off))
         found.append(rows[np.argsort(-off[rows], kind="stable")][:count])
     return np.concatenate(found)
-
-
-def compute_calibration(table: pa.Table, quantity: str) -> Array | None:
-    """Return what share of labels lies below each of `LEVELS` as a model states it, its errors taken as normal; None if it states none."""
-    label, said, std = (
-        to_floats(table, make_column_name(quantity, part)) for part in ("", "predicted", "predicted_std")
-    )
-    known = np.isfinite(label + said + std)
-    if not known.any():
-        return None
-    below = label[known, None] <= said[known, None] + std[known, None] * ndtri(LEVELS)
-    return np.asarray(below.mean(axis=0))

@@ -1,11 +1,11 @@
-"""What a model of the cost of a metre has to be able to do, and the kinds of model that there are.
+"""Protocol of a model of the cost of a metre, and the kinds of models.
 
 The kinds that tcpipe ships implement `Predictor` and nothing else, so that a model of your own can do all that they can. A kind is a
 class; only ``predict`` is needed, ``fit`` to be trained, and ``to_arrays`` with ``from_arrays`` to be kept in a model folder::
 
     class MeanOfClass:
         @classmethod
-        def fit(cls, samples): ...                     # Samples: patches, features, labels, weights, folds
+        def fit(cls, samples): ...                     # Samples: patches, features, labels, folds
         def predict(self, patches, features): ...      # power [W] and velocity [m/s], shape (N, 2), or (these, covariances (N, 2, 2))
         def to_arrays(self): ...                       # dict of numpy arrays
         @classmethod
@@ -43,13 +43,13 @@ Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """What the patches and features of a model are of, and what it predicts."""
+    """Inputs and outputs of a model."""
 
     channels: tuple[str, ...]
     """Layers of the patches."""
     patch_px: int
     planes: tuple[str, ...]
-    """What the last axis of patches holds: a channel, or ``name[1]``, ``name[2]`` … of one that has several planes."""
+    """Names along the last axis of patches: a channel, or ``name[1]``, ``name[2]`` … of one with several planes."""
     patch_m: float
     class_count: int
     """Largest class id of the table by which the terrain channel is scaled."""
@@ -67,7 +67,7 @@ class Inputs:
 
     @property
     def depth(self) -> int:
-        """Return how many planes a network takes: those of a patch, and one of each extra feature."""
+        """Return the number of planes of a network's input: those of a patch, and one for each extra feature."""
         return len(self.planes) + len(self.extra_features)
 
 
@@ -106,14 +106,14 @@ class Samples:
     """Labelled samples that a model is fitted to."""
 
     split: Split
-    """Of the dataset: every column of samples.parquet, and patches batch by batch."""
+    """Samples of the dataset: every column of samples.parquet, and patches batch by batch."""
     inputs: Inputs
     config: FitConfig
     idle_watt: float | None
-    """What the robot draws while it does not move; None where no run shows it."""
+    """Idle power [W]; None if no run measures it."""
 
     def __len__(self) -> int:
-        """Return how many they are."""
+        """Return the number of samples."""
         return len(self.split)
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Samples:
@@ -132,14 +132,8 @@ class Samples:
 
     @cached_property
     def labels(self) -> Floats:
-        """What is to be predicted, shape (N, outputs)."""
+        """Labels, shape (N, outputs)."""
         return self.split.labels.astype(np.float64)
-
-    @cached_property
-    def weights(self) -> Floats:
-        """Weight of each label, shape (N, outputs); 1 unless --inverse-variance-weights is given."""
-        weighed = self.config.inverse_variance_weights
-        return self.split.weights.astype(np.float64) if weighed else np.ones_like(self.labels)
 
     @property
     def folds(self) -> NDArray[np.generic]:
@@ -149,7 +143,7 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A training: what messages call it, and where its state is kept until it is done."""
+    """A training: its name in messages, and the file of its state."""
 
     name: str
     checkpoint: Path
@@ -157,7 +151,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """A fitted model, and what it, or models of the other folds, predict of samples that they were not fitted to."""
+    """A fitted model, and held-out predictions by it or by models of the other folds."""
 
     predictor: Predictor
     held_out: Prediction
@@ -174,13 +168,10 @@ class Fitted:
 class Predictor(Protocol):
     """A kind of model. Everything but ``predict`` has a default."""
 
-    about: ClassVar[str] = "code that is given with --predictor"
-    """One sentence, for MODEL.md."""
-    optimizer: ClassVar[str] = ""
     channels: ClassVar[tuple[str, ...]] = ()
-    """Channels that it looks at; empty: all of the dataset."""
+    """Channels that it uses; empty: all of the dataset."""
     features: ClassVar[tuple[str, ...] | None] = None
-    """Of ``turn_radpm`` and ``command_mps``, those that it takes; None: both, with --extra-features."""
+    """Extra features that it takes: ``turn_radpm``, ``command_mps``; None: both, with --extra-features."""
     stops_by_fold: ClassVar[bool] = False
     """Whether one fold of train stops its training, and the others alone are fitted."""
 
@@ -192,7 +183,7 @@ class Predictor(Protocol):
 
     @classmethod
     def fit(cls, samples: Samples) -> Predictor:
-        """Return the model fitted to samples; by default it is as it is, and learns nothing."""
+        """Return the model fitted to samples; the default returns an unfitted one."""
         del samples
         return cls()
 
@@ -237,7 +228,7 @@ def cross_fit(kind: type[Predictor], samples: Samples) -> Fitted:
     """Fit a model to all samples and, for predictions of each, to the other folds."""
     began, held_out = time.perf_counter(), cross_predict(kind, samples, samples.folds)
     whole = kind.fit(samples)
-    return Fitted(whole, held_out, training_times_s=TrainingTimes(time.perf_counter() - began, 0.0, len(samples)))
+    return Fitted(whole, held_out, training_times_s=TrainingTimes(time.perf_counter() - began, len(samples)))
 
 
 def cross_predict(kind: type[Predictor], samples: Samples, parts: NDArray[np.generic]) -> Prediction:
@@ -314,4 +305,4 @@ def compute_held_loss(held: Samples, predicted: Labels) -> float:
     scale = np.array(held.inputs.scale, np.float32)
     labels, predicted = (values.astype(np.float32) / scale for values in (held.labels, predicted))
     factors = compute_loss_factors(held.config.loss, held.inputs.scale)
-    return float(mean_loss(predicted, labels, factors, held.weights.astype(np.float32)))
+    return float(mean_loss(predicted, labels, factors))

@@ -9,8 +9,7 @@ channel  features
 height   slope along travel and steepness across it [rad], curvature along and across [1/m] of the best paraboloid, standard
          deviation of the ground from it (roughness) and highest minus lowest pixel (relief) [m]
 terrain  share of the patch that each class has
-band     mean and standard deviation of each band of a layer of several; the principal components of their means over the training
-         samples, 8 at most, come after the features of all channels
+band     mean and standard deviation of each band of a layer of several
 others   mean, standard deviation (contrast), mean difference of neighbours along travel (texture)
 ======== ==================================================================================================================
 
@@ -22,9 +21,9 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +42,6 @@ Floats = NDArray[np.float64]
 
 _OF_GROUND, _OF_BAND, _OF_OTHERS = 6, 2, 3
 """Features of a channel."""
-
-MOST_COMPONENTS = 8
-"""Principal components of a layer of several bands."""
 
 
 def compute_patch_features(patches: Patches, *, channels: Sequence[str], class_count: int, patch_m: float) -> Floats:
@@ -105,34 +101,6 @@ def _locate_features(channels: Sequence[str], class_count: int) -> Iterator[tupl
         at += _OF_BAND if _is_band(channel) else known.get(channel, _OF_OTHERS)
 
 
-@dataclass(frozen=True, slots=True)
-class Components:
-    """Principal components of some features: ``(features - centre) @ axes.T``; ``axes`` has the shape (components, features)."""
-
-    centre: Floats
-    axes: Floats
-
-    def append(self, features: Floats) -> Floats:
-        """Return features with their components behind them."""
-        return np.hstack([features, (features - self.centre) @ self.axes.T]) if len(self.axes) else features
-
-
-def fit_components(features: Floats, channels: Sequence[str], class_count: int) -> Components:
-    """Return the first principal components of the means of the bands of each layer, shape (N, features) of training samples."""
-    columns: dict[str, list[int]] = {}
-    for channel, at in _locate_features(channels, class_count):
-        if _is_band(channel):
-            columns.setdefault(channel.partition("[")[0], []).append(at)
-    centre, rows = features.mean(axis=0), [np.empty((0, features.shape[1]))]
-    for places in columns.values():
-        _, _, axes = np.linalg.svd(features[:, places] - centre[places], full_matrices=False)
-        axes = axes[:MOST_COMPONENTS]
-        axes *= np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]  # the sign is anyone's choice
-        rows.append(np.zeros((len(axes), features.shape[1])))
-        rows[-1][:, places] = axes
-    return Components(centre, np.concatenate(rows))
-
-
 def _compute_ground_features(height_m: Patches, patch_m: float) -> NDArray[np.float32]:
     px = height_m.shape[1]
     along = np.tile((np.arange(px) + 0.5) / px * patch_m - patch_m / 2.0, (px, 1))
@@ -160,12 +128,6 @@ def make_rules(config: TrainConfig) -> dict[str, str | float | bool]:
         "num_threads": 1, "deterministic": True, "force_col_wise": True, "verbosity": -1,
     }  # fmt: skip
 
-
-_NO_COMPONENTS = {"centre": np.empty(0), "axes": np.empty((0, 0))}
-_COMPONENT_FORMS: Mapping[str, ArrayForm] = {
-    "centre": ("float64", ("features",)),
-    "axes": ("float64", ("components", "features")),
-}
 
 _HEADER = (
     "tree\nversion=v4\nnum_class=1\nnum_tree_per_iteration=1\nlabel_index=0\nmax_feature_idx={last}\nobjective=regression\n"
@@ -212,7 +174,7 @@ def clean_trees(text: str, features: int) -> str:
 
 
 def grow(
-    features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.generic], config: TrainConfig | None = None
+    features: Floats, labels: Floats, folds: NDArray[np.generic], config: TrainConfig | None = None
 ) -> tuple[tuple[str, ...], Floats, int]:
     """Fit trees of every output, as many as are best where each fold is predicted by the others.
 
@@ -220,32 +182,30 @@ def grow(
 
     Parameters
     ----------
-    features
-        Shape (N, features), finite.
-    labels, weights
-        Shape (N, outputs).
-    folds
-        Of each sample, shape (N,); at least two.
+    features : finite, shape (N, features).
+    labels : shape (N, outputs).
+    folds : of each sample, shape (N,); at least two.
+    config : settings of LightGBM.
     """
     config = config or TrainConfig()
     lightgbm, held_out, trees, largest = _load_lightgbm(), np.empty(labels.shape), list[str](), 1
     rules, most = make_rules(config), config.trees
-    for number, (label, weight) in enumerate(zip(labels.T, weights.T, strict=True)):
+    for number, label in enumerate(labels.T):
         errors, by_fold = np.zeros(most), []
         for fold in np.unique(folds):
             held = folds == fold
             scores: dict[str, dict[str, list[float]]] = {}
-            data = lightgbm.Dataset(features[~held], label[~held], weight=weight[~held])
-            other = lightgbm.Dataset(features[held], label[held], weight=weight[held], reference=data)
+            data = lightgbm.Dataset(features[~held], label[~held])
+            other = lightgbm.Dataset(features[held], label[held], reference=data)
             by_fold.append((held, lightgbm.train(
                 rules, data, most, valid_sets=[other], callbacks=[lightgbm.record_evaluation(scores)]
             )))  # fmt: skip
-            found = scores["valid_0"]["l2"]  # ends where nothing can be split
-            errors += weight[held].sum() * np.array(found + found[-1:] * (most - len(found)))
+            found = scores["valid_0"]["l2"]  # shorter if nothing can be split
+            errors += held.sum() * np.array(found + found[-1:] * (most - len(found)))
         rounds = int(np.argmin(errors)) + 1
         for held, booster in by_fold:
             held_out[held, number] = booster.predict(features[held], num_iteration=rounds)
-        whole = lightgbm.train(rules, lightgbm.Dataset(features, label, weight=weight), rounds)
+        whole = lightgbm.train(rules, lightgbm.Dataset(features, label), rounds)
         trees.append(clean_trees(whole.model_to_string(), features.shape[1]))
         largest = max(largest, whole.num_trees())
     return tuple(trees), held_out, largest
@@ -263,7 +223,7 @@ def _load_lightgbm() -> Any:
 
 @dataclass(frozen=True)
 class TableModel:
-    """Curves and trees; ``channels`` and ``class_count`` say where slope and class stand in the features."""
+    """Curves and trees; ``channels`` and ``class_count`` give the columns of slope and class in the features."""
 
     curves: Curves
     trees: tuple[str, ...]
@@ -291,7 +251,6 @@ class TableModel:
 def fit_table(
     features: Floats,
     labels: Floats,
-    weights: Floats,
     folds: NDArray[np.generic],
     *,
     channels: Sequence[str],
@@ -305,15 +264,15 @@ def fit_table(
     Parameters
     ----------
     features : finite, shape (N, features): those of the channels, then any others.
-    labels, weights : shape (N, outputs).
+    labels : shape (N, outputs).
     folds : of each sample, shape (N,); at least two.
     channels, class_count : what the features are of.
     config : settings of LightGBM.
     """
     slope_rad, class_id = find_slope_and_class(features, channels, class_count)
     curve_labels = cross_fit_curves(slope_rad, class_id, labels, folds)
-    trees, held_out, count = grow(features, labels - curve_labels, weights, folds, config)
-    curves = fit_curves("linear", slope_rad, class_id, labels)
+    trees, held_out, count = grow(features, labels - curve_labels, folds, config)
+    curves = fit_curves(slope_rad, class_id, labels)
     return TableModel(curves, trees, tuple(channels), class_count), curve_labels + held_out, count
 
 
@@ -323,13 +282,6 @@ class BoostingModel(Predictor):
 
     table: TableModel
     inputs: Inputs
-    components: Components
-
-    about: ClassVar[str] = (
-        "a curve over the slope of each class, and boosted trees over features of the patch (LightGBM), their number chosen by "
-        "cross-validation over the folds of train"
-    )
-    optimizer: ClassVar[str] = "LightGBM"
 
     def predict(self, patches: Patches, features: ExtraFeatures) -> Floats:
         """Return outputs, shape (N, outputs)."""
@@ -337,25 +289,22 @@ class BoostingModel(Predictor):
         out = np.empty((len(patches), len(self.inputs.outputs)))
         for first in range(0, len(patches), _TOGETHER):
             rows = slice(first, first + _TOGETHER)
-            of_patches = self.components.append(self._compute_features(patches[rows]))
-            out[rows] = self.table.predict(np.column_stack([of_patches, numbers[rows]]))
+            out[rows] = self.table.predict(np.column_stack([self._compute_features(patches[rows]), numbers[rows]]))
         return out
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return curves, trees and principal components by name."""
-        return self.table.arrays() | (asdict(self.components) if len(self.components.axes) else {})
+        """Return curves and trees by name."""
+        return self.table.arrays()
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> BoostingModel:
         """Return the model of these arrays."""
         texts: dict[str, ArrayForm] = {f"trees_{at}": ("uint8", (f"bytes_{at}",)) for at in range(len(inputs.outputs))}
-        forms = {**texts, **list_curve_arrays(len(inputs.outputs)), **_COMPONENT_FORMS}
-        check_arrays(arrays, forms, optional=_COMPONENT_FORMS)
-        components = Components(*(arrays.get(name, empty) for name, empty in _NO_COMPONENTS.items()))
-        curves, _ = read_curves("linear", {name: array for name, array in arrays.items() if name.startswith("curve_")})
-        known = _count_features(inputs.planes, inputs.class_count) + len(components.axes) + len(inputs.extra_features)
+        check_arrays(arrays, {**texts, **list_curve_arrays(len(inputs.outputs))})
+        curves, _ = read_curves(arrays)
+        known = _count_features(inputs.planes, inputs.class_count) + len(inputs.extra_features)
         trees = tuple(clean_trees(arrays[name].tobytes().decode(errors="replace"), known) for name in texts)
-        return cls(TableModel(curves, trees, inputs.planes, inputs.class_count), inputs, components)
+        return cls(TableModel(curves, trees, inputs.planes, inputs.class_count), inputs)
 
     @classmethod
     def fit(cls, samples: Samples) -> Predictor:
@@ -370,26 +319,17 @@ class BoostingModel(Predictor):
         began, inputs = time.perf_counter(), samples.inputs
         numbers = standardize_features(inputs.extra_features, samples.features)
         plain = compute_features(samples.split, inputs.patch_m, inputs.class_count)
-        components = fit_components(plain, inputs.planes, inputs.class_count)
-        features = np.column_stack([components.append(plain), numbers])
-        fed_s = time.perf_counter() - began
+        features = np.column_stack([plain, numbers])
         table, held_out, trees = fit_table(
             features,
             samples.labels,
-            samples.weights,
             samples.folds,
             channels=inputs.planes,
             class_count=inputs.class_count,
             config=samples.config,
         )
-        times = TrainingTimes(time.perf_counter() - began, fed_s, len(samples))
-        return Fitted(
-            cls(table, inputs, components),
-            Prediction.without_covariance(held_out),
-            trees,
-            trees,
-            training_times_s=times,
-        )
+        times = TrainingTimes(time.perf_counter() - began, len(samples))
+        return Fitted(cls(table, inputs), Prediction.without_covariance(held_out), trees, trees, training_times_s=times)
 
     def _compute_features(self, patches: Patches) -> Floats:
         inputs = self.inputs

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +22,11 @@ from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.published_outputs import fetch_directory, find_newest, write_output
+from tcpipe.formats.published_outputs import find_newest
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, compute_costs
-from tcpipe.learning.model_card import KIND, LayerRange, ModelCard, TrainedOn, Training, TrainingRange, format_readme
-from tcpipe.learning.models import CARD, FILES, GROUND_COLUMNS, load_model, read_model_card, write_model
+from tcpipe.learning.model_card import KIND, LayerRange, ModelCard, TrainedOn, Training, TrainingRange
+from tcpipe.learning.models import CARD, FILES, GROUND_COLUMNS, load_model, write_model
 from tcpipe.learning.own_models import load_own_kind, report_errors
 from tcpipe.learning.physics_model import find_idle_power
 from tcpipe.learning.predictor import (
@@ -56,7 +55,7 @@ _CALLED = {"turn_radpm": "turn (mean_abs_yaw_rate_radps)", "command_mps": "comma
 
 @dataclass(frozen=True, slots=True)
 class TrainResult:
-    """What became of a training; ``str`` of it is what the command prints."""
+    """Result of a training; the command prints its ``str``."""
 
     path: str
     status: str
@@ -70,24 +69,21 @@ class TrainResult:
     held_out_loss: float
     device: str
     training_times_s: TrainingTimes
-    feeding_share: float
-    """Share of the time in which the network waited for batches."""
 
     def __str__(self) -> str:
-        """Return how it went, as plain lines."""
+        """Return samples, loss and time as plain lines."""
         if self.status == "unchanged":
             return f"{self.path}: nothing to do: trained on the same dataset with the same options"
         times = self.training_times_s
         best = f", best {self.best_epoch} of {self.epochs} epochs or trees" if self.epochs > 1 else ""
         return (
             f"{self.path}: {self.model} of {self.samples['fitted']} samples{best}\n"
-            f"loss {self.held_out_loss:.4f} of {self.samples['held out']} held-out samples; {times.total_s:.1f} s on {self.device}, "
-            f"{100.0 * self.feeding_share:.0f} % of it feeding"
+            f"loss {self.held_out_loss:.4f} of {self.samples['held out']} held-out samples; {times.total_s:.1f} s on {self.device}"
         )
 
 
 _PARTS = 5
-"""Parts of the runs that are predicted by the others; of fewer runs, folds are what errs alike."""
+"""Number of parts of the runs, each predicted by the others; with fewer runs, folds are the clusters of errors."""
 
 
 def choose_kind(data: Dataset, config: FitConfig, split: Split | None = None) -> ModelKind:
@@ -145,17 +141,17 @@ def train(
     no_resume: bool = False,
     predictor: str | None = None,
 ) -> TrainResult:
-    """Train a model on a dataset and write the model folder ``out``, whole or not at all.
+    """Train a model on a dataset and write the model folder ``out``, complete or not at all.
 
     Parameters
     ----------
     dataset : what ``tcpipe build-dataset`` wrote.
     out : a new folder, or one with only a model, which is replaced unless it is complete and of the same dataset and options; or a URL in a
-        bucket, where it becomes the newest build. ``<out>.KEY.checkpoint`` beside a folder keeps the state, so that a training
-        continues; another dataset, or other options, have another one.
+        bucket, where it becomes the newest build. ``<out>.KEY.checkpoint`` beside the folder, or in this one for a URL, keeps the state,
+        so that a training resumes; another dataset, or other options, have another one.
     config : the options.
     no_resume : ignore an earlier state.
-    predictor : code of the user, ``FILE.py[:NAME]`` or an entry point, that is fitted instead of a shipped kind.
+    predictor : code of the user, ``FILE.py[:NAME]``, that is fitted instead of a shipped kind.
     """
     rules = config or FitConfig()
     own = None if predictor is None else load_own_kind(predictor)
@@ -167,18 +163,12 @@ def train(
             "--without-patches, or train your own model on its samples.parquet"
         )
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules)})
-    if is_url(out):
-        again = partial(train, dataset, config=rules, predictor=predictor)
-        return _train_into_bucket(str(out).rstrip("/"), key, again)
-    place = Path(out)
-    clear_beside(place)
-    named = place if place.name not in {"", ".."} else place.resolve()
-    checkpoint = named.with_name(f"{named.name}.{key[:8]}.checkpoint")
+    checkpoint = _name_checkpoint(out, key)
     if no_resume:
         checkpoint.unlink(missing_ok=True)
-    elif (known := _read_known_model(place, predictor)) is not None and known.training.key == key:
+    elif (known := _read_known_model(out, predictor)) is not None and known.training.key == key:
         checkpoint.unlink(missing_ok=True)  # of a training that was killed after it wrote its model
-        return _make_result(place, "unchanged", known.training, TrainingTimes())
+        return _make_result(out, "unchanged", known.training, TrainingTimes())
     name = choose_kind(data, rules) if rules.model == "auto" else rules.model
     kind = find_kind(name) if own is None else own.kind
     if kind.channels and rules.layers and rules.model != "auto":
@@ -189,9 +179,9 @@ def train(
     else:
         _report_layers(data, rules.layers or data["train"].channels, is_chosen=bool(rules.layers))
     samples = make_samples(data, rules, kind)
-    _reject_other_files(place)
+    _reject_other_files(out)
     with report_errors(own):
-        fitted = kind.fit_folds(samples, Job(str(place), checkpoint))
+        fitted = kind.fit_folds(samples, Job(str(out), checkpoint))
         near = _predict_near(kind, samples, CLOSE * data.card.recipe.segment.chord_m)
         weights = {name: np.asarray(array) for name, array in kind.to_arrays(fitted.predictor).items()}
     if own is not None and (missing := int((~find_held_out(fitted.held_out)).sum())):
@@ -199,22 +189,20 @@ def train(
     card = _make_card(data, samples, fitted, key, name)
     history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.history)
     write_model(
-        place, card=card, weights=weights, residuals=_make_residuals_table(samples, fitted, near),
+        out, card=card, weights=weights, residuals=_make_residuals_table(samples, fitted, near),
         ground=pa.table(dict(zip(GROUND_COLUMNS, _find_middles(_select_used(samples, fitted)).T, strict=True))),
-        history="epoch,loss,held_out_loss\n" + history, readme=format_readme(card),
+        history="epoch,loss,held_out_loss\n" + history,
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
-    return _make_result(place, "done", card.training, fitted.training_times_s)
+    return _make_result(out, "done", card.training, fitted.training_times_s)
 
 
-def _train_into_bucket(url: str, key: str, run: Callable[[Path], TrainResult]) -> TrainResult:
-    """Train on this machine, and put the model to a URL."""
-    known = read_model_card(fetch_directory(url)) if find_newest(url, [CARD]) else None
-    if known is not None and known.training.key == key:
-        return _make_result(url, "unchanged", known.training, TrainingTimes())
-    with write_output(url, CARD) as place:
-        result = run(place)
-    return replace(result, path=url)
+def _name_checkpoint(out: str | Path, key: str) -> Path:
+    """Return the file that keeps the state of a training."""
+    place = Path(str(out).rstrip("/").rpartition("/")[2]) if is_url(out) else Path(out)
+    clear_beside(place)
+    named = place if place.name not in {"", ".."} else place.resolve()
+    return named.with_name(f"{named.name}.{key[:8]}.checkpoint")
 
 
 def _report_layers(data: Dataset, channels: Sequence[str], *, is_chosen: bool) -> None:
@@ -238,7 +226,7 @@ def compute_dataset_checksum(card: DatasetCard) -> str:
 
 
 def select_train(data: Dataset, rules: FitConfig, kind: type[Predictor] = Predictor) -> Split:
-    """Return the labelled samples of train that a kind of model is fitted to; `DatasetError` where there are none."""
+    """Return the labelled samples of train that a kind of model is fitted to; `DatasetError` without any."""
     train = data["train"]
     wanted = np.isfinite(train.labels).all(axis=1)
     if unlabelled := len(train) - int(wanted.sum()):
@@ -253,7 +241,7 @@ def select_train(data: Dataset, rules: FitConfig, kind: type[Predictor] = Predic
 
 
 def make_samples(data: Dataset, rules: FitConfig, kind: type[Predictor], train: Split | None = None) -> Samples:
-    """Return what a model of a kind is fitted to: labelled samples ``train``, or all that `select_train` finds, which need folds."""
+    """Return the samples of a kind of model: labelled samples ``train``, or all that `select_train` finds, which need folds."""
     needs_folds = train is None
     if train is None:
         train = select_train(data, rules, kind)
@@ -271,13 +259,6 @@ def make_samples(data: Dataset, rules: FitConfig, kind: type[Predictor], train: 
             f"expected both (there are folds {', '.join(map(str, np.unique(folds)))}; {cure})"
         )
     used = fitted if kind.stops_by_fold else train
-    if rules.inverse_variance_weights:
-        unstated = [label for label, weights in zip(outputs, used.weights.T, strict=True) if not weights.any()]
-        if unstated:
-            raise DatasetError(
-                f"{data.path}: no sample has a standard deviation of {', '.join(unstated)} to weigh it by; "
-                "train without --inverse-variance-weights"
-            )
     extra_features: tuple[ExtraFeature, ...] = ()
     if kind.features or (kind.features is None and rules.extra_features):
         extra_features = _find_extra_features(used, kind.features, data)
@@ -329,8 +310,11 @@ def find_training_range(split: Split) -> TrainingRange:
     return TrainingRange(class_counts, tuple(sorted(pixel_classes)), ranges, own)
 
 
-def _read_known_model(place: Path, predictor: str | None) -> ModelCard | None:
-    """Return the card of the model that is there; None if there is none, a damaged one, or one of another schema."""
+def _read_known_model(out: str | Path, predictor: str | None) -> ModelCard | None:
+    """Return the card of the model at ``out``; None without one, or if it is damaged or of another schema."""
+    if is_url(out):
+        return load_model(out, predictor).card if find_newest(str(out), [CARD]) else None
+    place = Path(out)
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None
     with suppress(StoreError):
@@ -341,8 +325,9 @@ def _read_known_model(place: Path, predictor: str | None) -> ModelCard | None:
     return None
 
 
-def _reject_other_files(place: Path) -> None:
+def _reject_other_files(out: str | Path) -> None:
     """Raise `UsageError` if the folder contains files that are not part of a model."""
+    place = Path(out)
     entries = {entry.name for entry in place.iterdir()} if place.is_dir() else set()
     strangers = sorted(name for name in entries - set(FILES) if not name.startswith("."))
     if strangers:
@@ -355,7 +340,6 @@ def _make_result(place: Path | str, status: str, training: Training, times: Trai
     return TrainResult(
         path=str(place), status=status, model=training.kind, samples=training.samples, epochs=training.epochs,
         best_epoch=training.best_epoch, held_out_loss=training.held_out_loss, device=training.device, training_times_s=times,
-        feeding_share=times.feeding_share,
     )  # fmt: skip
 
 
@@ -383,7 +367,6 @@ def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str, kind: 
             key=key,
             config=config,
             kind=kind,
-            optimizer=getattr(fitted.predictor, "optimizer", ""),
             samples={"fitted": len(used), "held out": len(held)},
             epochs=fitted.epochs,
             best_epoch=fitted.best_epoch,

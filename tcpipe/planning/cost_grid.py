@@ -1,4 +1,4 @@
-"""The cost of a metre along 16 courses at the cells of a coarse grid over a map (ADR-27).
+"""Costs of a metre along 16 courses in the cells of a coarse grid over a map (ADR-27).
 
 A cell is a square of ``cell_size_m`` map metres; its cost along a course is that of the metre of ground around its middle,
 driven that way. The courses are the directions to the nearest 16 cells that can be reached without passing another's centre:
@@ -8,7 +8,7 @@ steps is at most 1 / cos(13.3°) - 1 = 2.8 % longer than a straight line.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,9 +49,9 @@ ANGLES_DEG = np.degrees(np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0])) % 360.0
 
 @dataclass(frozen=True, slots=True)
 class CrossedCell:
-    """A cell that a step touches: east and north of where it begins, in cells, and the share of the step that lies in it.
+    """A cell that a step touches: east and north of its start [cells], and the share of the step inside.
 
-    A share of 0 is a corner: the step only touches it, but a robot has a width.
+    A share of 0 is a corner that the step only touches; a robot has a width.
     """
 
     east: int
@@ -83,12 +83,12 @@ Cells = NDArray[np.int64]
 CELLS_OF_BLOCK = BATCH // COURSES
 
 _STRIP_TILES = CACHED_TILES // 3 - 3
-"""Tiles across a strip of the map: three rows of it are held at once (`tcpipe.terrain.tiles`)."""
+"""Tiles across a strip of the map, of which three rows are in memory (`tcpipe.terrain.tiles`)."""
 
 _ROWS_TOGETHER = 256
 
 BARRED = NO_COST | Reason.OBSTACLE
-"""Ground that a planner never crosses."""
+"""Reasons of ground that a planner never crosses."""
 
 
 def make_grid(source: MapReader, cell_size_m: float) -> MapGrid:
@@ -104,7 +104,7 @@ def make_grid(source: MapReader, cell_size_m: float) -> MapGrid:
 
 @dataclass(frozen=True, slots=True)
 class CostGrid:
-    """What is known of every cell and course.
+    """Costs and reasons of every cell and course.
 
     Attributes
     ----------
@@ -121,19 +121,29 @@ class CostGrid:
     height_m: Floats32
 
     def per_metre(self, objective: str) -> Floats32:
-        """Return what a metre costs: ``energy`` [J/m], ``time`` [s/m] or ``distance`` [m/m]; NaN where it is not known."""
+        """Return the cost of a metre: ``energy`` [J/m], ``time`` [s/m] or ``distance`` [m/m]; NaN if unknown."""
         if objective == "distance":
             return np.ones_like(self.velocity_mps)
         slowness = 1.0 / self.velocity_mps
         return np.asarray(self.power_watt * slowness if objective == "energy" else slowness)
 
     def open_courses(self, *, allow_extrapolation: bool) -> NDArray[np.bool_]:
-        """Return where a course may be driven, shape (16, rows, cols): without obstacle, and on ground the model knows."""
+        """Return the courses that may be driven, shape (16, rows, cols): without obstacle, and inside the training range."""
         forbidden = np.uint16(BARRED) if allow_extrapolation else np.uint16(0xFFFF)
         return np.asarray(self.reasons & forbidden == 0)
 
+    def take(self, cells: Cells) -> dict[str, NDArray[np.generic]]:
+        """Return all that is known of cells (flat indices, (n,)) by name."""
+        shapes = {"power_watt": COURSES, "velocity_mps": COURSES, "reasons": COURSES, "height_m": 1}
+        return {name: getattr(self, name).reshape(count, -1)[:, cells] for name, count in shapes.items()}
+
+    def load(self, cells: Cells, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+        """Write the arrays of `take`."""
+        for name, values in arrays.items():
+            getattr(self, name).reshape(len(values), -1)[:, cells] = values
+
     def put(self, cells: Cells, found: SegmentPredictions) -> None:
-        """Write what was said of cells (flat indices, (n,)), 16 verdicts a cell, courses fastest."""
+        """Write the predictions of cells (flat indices, (n,)), 16 a cell, courses fastest."""
         for name in ("power_watt", "velocity_mps", "reasons"):
             array = getattr(self, name)
             array.reshape(COURSES, -1)[:, cells] = getattr(found, name).reshape(-1, COURSES).T
@@ -144,7 +154,7 @@ class CostGrid:
 
 
 def make_empty_grid(grid: MapGrid) -> CostGrid:
-    """Return a grid of which nothing is known, in memory."""
+    """Return a grid without predictions."""
     shape = (COURSES, grid.rows, grid.cols)
     nothing = np.float32(np.nan)
     return CostGrid(
@@ -185,7 +195,7 @@ def iterate_blocks(
 
 
 class CellFrames:
-    """Frames of the metres through the middles of cells, 16 a cell; the map's scale is taken where the cells lie."""
+    """Frames of the metres through the middles of cells, 16 a cell, with the map's scale at the cells."""
 
     __slots__ = ("_corners", "_grid")
 
@@ -204,7 +214,7 @@ class CellFrames:
         return PatchFrames(np.repeat(centre, COURSES, axis=0), along, np.stack([-along[:, 1], along[:, 0]], axis=1))
 
     def metres(self, cells: Cells) -> NDArray[np.float64]:
-        """Return ground metres a map metre along each course, shape (16,), where cells lie; between the grid's corners it is linear."""
+        """Return ground metres a map metre along each course at the cells, shape (16,), linear between the grid's corners."""
         down, right = np.divmod(cells, self._grid.cols)
         v, u = down.mean() / max(self._grid.rows - 1, 1), right.mean() / max(self._grid.cols - 1, 1)
         (north_west, north_east), (south_west, south_east) = self._corners
@@ -217,40 +227,30 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class LazyCostGrid:
-    """Costs and reasons, and of which cells they are known, shape (rows, cols) each."""
+    """Costs of a map's cells, and which cells are predicted, shape (rows, cols)."""
 
     model: Model
     source: MapReader
     costs: CostGrid
-    judged: Mask
     predicted: Mask
     frames: CellFrames
 
-    def judge(self, wanted: Mask, step: Callable[[int, int], None]) -> None:
-        """Learn what ground the wanted cells are, without predictions."""
-        self._learn(wanted & ~self.judged, step, ask=False)
-        self.judged[wanted] = True
-
     def predict(self, wanted: Mask, step: Callable[[int, int], None]) -> None:
-        """Learn what the wanted cells cost."""
-        self._learn(wanted & ~self.predicted, step, ask=True)
-        self.judged[wanted] = True
+        """Predict the wanted cells that are not predicted yet."""
+        todo = list(iterate_blocks(self.source, self.model, self.costs.grid, wanted & ~self.predicted))
+        answers = iterate_predictions(self.model, self.source, (self.frames.of(cells) for cells in todo))
+        for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
+            self.costs.put(cells, found)
+            step(number, len(todo))
         self.predicted[wanted] = True
 
     def class_id(self) -> Classes:
         """Return the class under the middle of each cell, shape (rows, cols); 0 without data, or without classes."""
         return read_classes(self.source, self.costs.grid)
 
-    def _learn(self, wanted: Mask, step: Callable[[int, int], None], *, ask: bool) -> None:
-        todo = list(iterate_blocks(self.source, self.model, self.costs.grid, wanted))
-        answers = iterate_predictions(self.model, self.source, (self.frames.of(cells) for cells in todo), ask=ask)
-        for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
-            self.costs.put(cells, found)
-            step(number, len(todo))
-
 
 def iterate_row_strips(grid: MapGrid) -> Iterator[tuple[int, int]]:
-    """Yield the first row and the end of each strip of a grid that is held at once."""
+    """Yield the first row and the end of each strip of a grid that is in memory at once."""
     for first in range(0, grid.rows, _ROWS_TOGETHER):
         yield first, min(first + _ROWS_TOGETHER, grid.rows)
 
@@ -267,10 +267,8 @@ def read_classes(source: MapReader, grid: MapGrid) -> Classes:
 
 
 def make_survey(model: Model, source: MapReader, costs: CostGrid | float) -> LazyCostGrid:
-    """Return a survey of which all is known, from a cost map, or of cells of this side [m] of which nothing is."""
-    is_known = True
-    if not isinstance(costs, CostGrid):
-        costs, is_known = make_empty_grid(make_grid(source, costs)), False
-    known = np.full((2, costs.grid.rows, costs.grid.cols), is_known)
-    frames = CellFrames(costs.grid, where=f"map {source.name}")
-    return LazyCostGrid(model, source, costs, known[0], known[1], frames)
+    """Return a survey from a cost map, or one of cells of this side [m] without any prediction."""
+    is_known = isinstance(costs, CostGrid)
+    costs = costs if isinstance(costs, CostGrid) else make_empty_grid(make_grid(source, costs))
+    known = np.full((costs.grid.rows, costs.grid.cols), is_known)
+    return LazyCostGrid(model, source, costs, known, CellFrames(costs.grid, where=f"map {source.name}"))

@@ -2,22 +2,22 @@
 
 ::
 
-    cost-map.json                      what it is made from, courses, reasons, shares, checksums
+    cost-map.json                      sources, courses, reasons, shares, checksums
     power.tif velocity.tif             [W], [m/s]: a band a course, then min, mean, best course, std over the trusted courses
     duration.tif energy.tif            [s/m], [J/m]: the same
     reasons.tif                        `Reason` bits: a band a course, then those that all courses share
     height.tif                         of the cells' middles [m]
     duration.{yaml,pgm} energy.{…}     Nav2 maps of the mean over the trusted courses
-    duration.qml energy.qml            how QGIS shows duration.tif and energy.tif: the mean, by colour
+    keepout.{yaml,pgm} speed.{…}       masks of Nav2's costmap filters: ground without a trusted course, and the mean velocity
+    nav2.yaml                          parameters of Nav2 for these maps
 """
 
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from shutil import rmtree
@@ -28,22 +28,22 @@ from numpy.typing import NDArray
 
 from tcpipe.cost.prediction_errors import Errors
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
-from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
+from tcpipe.formats.atomic import clear_beside, lock_directory, make_scratch_directory, write_text
 from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as, write_sealed
-from tcpipe.formats.json_files import digest, read_json, write_json
+from tcpipe.formats.json_files import digest
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, make_raster_style, write_nav2_map
+from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, format_nav2_parameters, write_nav2_map, write_nav2_mask
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place, find_wrong_files
-from tcpipe.formats.published_outputs import fetch_directory, find_newest, write_output
+from tcpipe.formats.published_outputs import fetch_directory, find_newest, publish_directory
+from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_grid import (
     ANGLES_DEG,
     BARRED,
     COURSES,
     CellFrames,
-    Cells,
     CostGrid,
     iterate_blocks,
     iterate_row_strips,
@@ -64,23 +64,23 @@ Step: TypeAlias = Callable[[int, int], None]
 
 CARD = "cost-map.json"
 KIND = "tcpipe cost map"
-VERSION = "1.3"
+VERSION = "1.4"
 
-_BLOCKS_KEPT = 8
-"""Blocks after which what is done is on disk."""
+_BLOCKS_KEPT = 64
+"""Blocks in a file of finished cells."""
 
 _QUANTITIES = {"power": "W", "velocity": "m/s", "duration": "s/m", "energy": "J/m"}
 _BAND_NAMES = tuple(f"course {angle:.1f} deg" for angle in ANGLES_DEG)
 _MEAN_BAND = COURSES + 2
 AGGREGATION = "mean over the courses without a reason"
-"""Of a cell: the mean band and the Nav2 maps."""
+"""Aggregation of the courses of a cell in the mean band and the Nav2 maps."""
 
 _GREATEST_IS_BEST = "velocity"
 
 
 @dataclass(frozen=True, slots=True)
 class Nav2Scale:
-    """What the least and the greatest cost of a Nav2 map stand for, a metre of ground."""
+    """Costs of a metre of ground for the smallest and the largest value of a Nav2 map."""
 
     lowest: float
     highest: float
@@ -88,7 +88,7 @@ class Nav2Scale:
 
 @dataclass(frozen=True, slots=True)
 class CellCounts:
-    """Cells of the grid, those with a cost along some course, and those of them on ground that the model knows."""
+    """Numbers of cells: of the grid, with a cost along some course, and of these inside the training range."""
 
     all: int
     with_cost: int
@@ -100,7 +100,7 @@ class CostMapCard:
     """All of cost-map.json but its seal."""
 
     key: str
-    """Of what it is made from: model, map and step."""
+    """Hash of model, map and cell size."""
     map: str
     model: str
     """The model's checksum."""
@@ -118,13 +118,13 @@ class CostMapCard:
     nav2_scale: Mapping[str, Nav2Scale]
     cells: CellCounts
     reason_share: Mapping[str, float]
-    """Of cells and courses."""
+    """Share of cells and courses with each reason."""
     barred_by: tuple[str, ...] = tuple(flag_name(reason) for reason in Reason if reason & BARRED)
     aggregation: str = AGGREGATION
-    """Of the courses of a cell, in its bands and in the Nav2 maps."""
+    """Aggregation of the courses of a cell in its bands and in the Nav2 maps."""
     checksums: Mapping[str, Checksum]
     origin_deg: tuple[float, float] | None = None
-    """Longitude and latitude where the frame of the Nav2 maps begins; None where it is the CRS's own."""
+    """Longitude and latitude of the origin of the Nav2 maps; None: they are in the plane of the CRS."""
     label_energy: str = "total"
     """``total`` or ``net``: which power and energy it is."""
     kind: str = KIND
@@ -133,7 +133,7 @@ class CostMapCard:
 
 @dataclass(frozen=True, slots=True)
 class CostMapResult:
-    """What became of a cost map; ``str`` of it is what the command prints."""
+    """Result of a cost map; the command prints its ``str``."""
 
     path: str
     status: str
@@ -141,7 +141,7 @@ class CostMapResult:
     card: CostMapCard
 
     def __str__(self) -> str:
-        """Return where it is and what it holds, as plain lines."""
+        """Return path and content as plain lines."""
         grid, cells = self.card.grid, self.card.cells
         head = f"{self.path}: {grid.rows} x {grid.cols} cells of {grid.pixel_size_m:g} m, {COURSES} courses"
         if self.status == "unchanged":
@@ -157,7 +157,7 @@ class CostMapResult:
 
 
 def make_cost_map_key(model: Model, source: MapFile, cell_size_m: float) -> str:
-    """Return what a cost map is made from, as a digest."""
+    """Return the hash of the inputs of a cost map."""
     return digest({"model": model.checksum, "map": source.summary(), "cell_size_m": cell_size_m, "version": VERSION})
 
 
@@ -170,60 +170,62 @@ def make_cost_map(
     origin_deg: tuple[float, float] | None = None,
     step: Step = lambda _, __: None,
 ) -> CostMapResult:
-    """Write the cost map of a whole map to ``out``, whole or not at all; an interrupted call goes on where it was.
+    """Write the cost map of a whole map to ``out``, complete or not at all; an interrupted call resumes.
 
     Parameters
     ----------
-    model, source : who predicts, and the map.
-    out : its directory: new, empty, or a cost map, which is replaced unless it is made from the same; or a URL in a bucket, where it
-        becomes the newest build, and an interrupted call begins anew.
+    model, source : the model and the map.
+    out : its directory: new, empty, or a cost map, which is replaced unless its inputs are the same; or a URL in a bucket, where it
+        becomes the newest build, and an interrupted call starts again.
     cell_size_m : side of a cell in the map's plane [m].
     origin_deg : longitude and latitude of the origin of the Nav2 maps, whose axes are true east and north; without one they are in the
         plane of the map's CRS.
-    step : is told how many blocks of how many are done.
+    step : called with how many blocks of how many are done.
 
-    Raises `ModelError` or `MapError` where the map lacks what the model needs, is smaller than a cell or cannot be read; `UsageError` or
-    `StoreError` where ``out`` is something else or cannot be written, or the origin is far from the map.
+    Raises `ModelError` or `MapError` if the map lacks a layer, is smaller than a cell or cannot be read; `UsageError` or `StoreError` if
+    ``out`` is something else or cannot be written, or the origin is far from the map.
     """
     check_model(model, source)
-    key = make_cost_map_key(model, source, cell_size_m)
-    if is_url(out):
-        url = str(out)
-        known = read_cost_map_card(fetch_directory(url)) if find_newest(url, [CARD]) else None
-        if known is not None and (known.key, known.origin_deg) == (key, origin_deg):
-            return CostMapResult(url, "unchanged", known)
-        with write_output(url, CARD) as place:
-            made = make_cost_map(model, source, place, cell_size_m=cell_size_m, origin_deg=origin_deg, step=step)
-        return replace(made, path=url)
-    out = Path(out)
-    clear_beside(out)
+    key, out = make_cost_map_key(model, source, cell_size_m), str(out).rstrip("/")
     grid, frame = make_grid(source, cell_size_m), make_frame(source, origin_deg)
-    if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out}: exists and is no cost map; give another directory")
-    with _claim_spool(out) as place:
-        found = read_cost_map_card(out)  # another process may have been first
-        if found is not None and found.key == key and not any(find_wrong_files(Place(out), found.checksums)):
-            if found.origin_deg == origin_deg:
-                rmtree(place)
-                return CostMapResult(str(out), "unchanged", found)
-            costs = open_cost_map(out, found)
-        else:
-            costs = _predict_cells(model, source, place, key, grid, step)
-        with write_atomic_directory(out) as directory:
-            strips = _Strips(costs, model.errors, read_classes(source, grid))
-            scales = _write_files(directory, strips, frame)
+    if not is_url(out):
+        _check_directory(Path(out))
+    with _claim_spool(out) as spool:
+        found = _read_known(out, key)  # after the lock: another process may have been first
+        if found is not None and found.origin_deg == origin_deg:
+            return CostMapResult(out, "unchanged", found)
+        known = None if found is None else open_cost_map(fetch_directory(out), found)
+        costs = known or _predict_cells(model, source, spool, key, grid, step)
+        with publish_directory(out, CARD) as directory:
+            scales = _write_files(directory, _Strips(costs, model.errors, read_classes(source, grid)), frame)
             cells, shares = _compute_shares(costs)
             card = CostMapCard(
                 key=key, map=source.name, model=model.checksum, robot=model.card.robot, label_energy=model.card.label_energy, grid=grid,
                 nav2_scale=scales, cells=cells, reason_share=shares, checksums=compute_checksums(directory), origin_deg=origin_deg,
             )  # fmt: skip
             write_sealed(directory / CARD, card)
-        rmtree(place)
-    return CostMapResult(str(out), "done", card)
+    return CostMapResult(out, "done", card)
+
+
+def _check_directory(out: Path) -> None:
+    """Raise `UsageError` for something else than a cost map."""
+    clear_beside(out)
+    if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"{out}: exists and is no cost map; give another directory")
+
+
+def _read_known(out: str, key: str) -> CostMapCard | None:
+    """Return the card of the complete cost map with this key in a directory, or of the newest at a URL; else None."""
+    if is_url(out) and find_newest(out, [CARD]) is None:
+        return None
+    place = fetch_directory(out)
+    card = read_cost_map_card(place)
+    is_same = card is not None and card.key == key and not any(find_wrong_files(Place(place), card.checksums))
+    return card if is_same else None
 
 
 def read_cost_map_card(path: Path) -> CostMapCard | None:
-    """Return the card of a cost map, or None where there is none, or one that is not as it was written."""
+    """Return the card of a cost map; None without one, or if it has changed since it was written."""
     try:
         card = read_sealed_as(path / CARD, CostMapCard)
     except StoreError:
@@ -241,13 +243,14 @@ def open_cost_map(path: Path, card: CostMapCard) -> CostGrid:
     return CostGrid(card.grid, power, velocity, reasons, read_bands(path / "height.tif", (1,))[0])
 
 
-_ARRAYS = ("power_watt", "velocity_mps", "reasons", "height_m")
-
-
 @contextmanager
-def _claim_spool(out: Path) -> Iterator[Path]:
-    """Yield the directory beside ``out`` where its costs wait, for one process at a time; it stays when that is interrupted."""
-    whole = out.absolute()
+def _claim_spool(out: str) -> Iterator[Path]:
+    """Yield a directory for finished cells: beside ``out``, for one process at a time, where it stays after an interruption."""
+    if is_url(out):
+        with make_scratch_directory() as scratch:
+            yield scratch
+        return
+    whole = Path(out).absolute()
     place = whole.parent / f".{whole.name}.partial"
     try:
         place.mkdir(parents=True, exist_ok=True)
@@ -256,67 +259,31 @@ def _claim_spool(out: Path) -> Iterator[Path]:
     with lock_directory(place):
         place.mkdir(exist_ok=True)  # another process may have finished meanwhile
         yield place
-    with suppress(OSError):
-        place.rmdir()
+        rmtree(place)
 
 
 def _predict_cells(  # noqa: PLR0917
-    model: Model, source: MapFile, place: Path, key: str, grid: MapGrid, step: Step
+    model: Model, source: MapFile, spool: Path, key: str, grid: MapGrid, step: Step
 ) -> CostGrid:
-    """Return the costs of all cells, in files of ``place`` that outlive an interruption; what is done of ``key`` is not done again."""
-    if _read_job(place) != key:
-        _make_spool(place, key, grid)
-    held = {name: np.load(place / f"{name}.npy", mmap_mode="r+") for name in (*_ARRAYS, "done")}
-    files, done = tuple(held.values()), held.pop("done")
-    costs, frames = CostGrid(grid, **held), CellFrames(grid, where=f"map {source.name}")
-    missing = (done == 0).reshape(grid.rows, grid.cols)
-    todo = list(iterate_blocks(source, model, grid, missing))
-    if not missing.all():
-        logger.info("resuming: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
-    ready: list[Cells] = []
-    answers = iterate_predictions(model, source, (frames.of(cells) for cells in todo))
-    for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
-        costs.put(cells, found)
-        ready.append(cells)
-        if len(ready) == _BLOCKS_KEPT or number == len(todo):
-            for file in files:  # what is known, then that it is done
-                file.flush()
-            done[np.concatenate(ready)] = 1
-            ready = []
-        step(number, len(todo))
+    """Return the costs of all cells; files of ``spool`` keep finished ones, so that an interrupted call resumes."""
+    costs, frames = make_empty_grid(grid), CellFrames(grid, where=f"map {source.name}")
+    blocks = list(iterate_blocks(source, model, grid))
+    for other in spool.iterdir():
+        if not other.name.startswith(key[:16]):
+            other.unlink()
+    for first in range(0, len(blocks), _BLOCKS_KEPT):
+        here, file = blocks[first : first + _BLOCKS_KEPT], spool / f"{key[:16]}-{first}.npz"
+        cells = np.concatenate(here)
+        if file.is_file():
+            costs.load(cells, read_arrays(file))
+        else:
+            answers = iterate_predictions(model, source, (frames.of(block) for block in here))
+            for number, (block, found) in enumerate(zip(here, answers, strict=True), first + 1):
+                costs.put(block, found)
+                step(number, len(blocks))
+            write_arrays(file, costs.take(cells))
+        step(first + len(here), len(blocks))
     return costs
-
-
-def _make_spool(place: Path, key: str, grid: MapGrid) -> None:
-    """Write files of costs of which none is known."""
-    for file in place.iterdir():
-        file.unlink()
-    nothing = make_empty_grid(replace(grid, rows=1, cols=1))
-    for name in _ARRAYS:
-        one = getattr(nothing, name)
-        array = np.lib.format.open_memmap(
-            place / f"{name}.npy", "w+", one.dtype, (*one.shape[:-2], grid.rows, grid.cols)
-        )
-        _allocate(place / f"{name}.npy", array.offset + array.nbytes)
-        array[...] = one
-    np.save(place / "done.npy", np.zeros(grid.rows * grid.cols, np.uint8))
-    write_json(place / "job.json", {"key": key})
-
-
-def _allocate(path: Path, size_bytes: int) -> None:
-    """Take room on the disk: where it is full that is an error here, not a crash later."""
-    try:
-        with path.open("r+b") as opened:
-            os.posix_fallocate(opened.fileno(), 0, size_bytes)
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be written ({error.strerror}); expected {size_bytes / 1e6:.0f} MB") from None
-
-
-def _read_job(place: Path) -> str | None:
-    try:
-        return str(read_json(place / "job.json")["key"])
-    except (StoreError, KeyError):
-        return None
 
 
 def _write_files(directory: Path, strips: _Strips, frame: Frame) -> dict[str, Nav2Scale]:
@@ -341,8 +308,9 @@ def _write_files(directory: Path, strips: _Strips, frame: Frame) -> dict[str, Na
         bands=height,
     )
     scales = {name: _write_nav2(directory / f"{name}.yaml", strips, name, frame) for name in ("duration", "energy")}
-    for name, scale in scales.items():
-        write_text(directory / f"{name}.qml", make_raster_style(_MEAN_BAND, scale.lowest, scale.highest))
+    step_mps = _write_masks(directory, strips, frame)
+    energy = asdict(scales["energy"]) | {"quantity": "energy", "unit": _QUANTITIES["energy"]}
+    write_text(directory / "nav2.yaml", format_nav2_parameters(**energy, speed_step_mps=step_mps))
     return scales
 
 
@@ -387,12 +355,24 @@ def _read_reasons(costs: CostGrid, first: int, last: int) -> NDArray[np.uint16]:
     return np.concatenate([bits, np.bitwise_and.reduce(bits, axis=0)[None]])
 
 
+def _compute_mean(strips: _Strips, name: str) -> NDArray[np.float64]:
+    """Return the mean of a quantity over the trusted courses, shape (rows, cols); NaN without any."""
+    rows = iterate_row_strips(strips.costs.grid)
+    return np.concatenate([strips.compute(name, first, last)[_MEAN_BAND - 1] for first, last in rows])
+
+
+def _resample(
+    values: NDArray[np.uint8], outside: int, grid: MapGrid, frame: Frame
+) -> tuple[NDArray[np.uint8], MapGrid]:
+    """Return the values of cells on a grid of the frame, and the grid."""
+    own = frame.cover(grid)
+    cells, is_on = frame.find_cells(grid, own)
+    return np.where(is_on, values.reshape(-1)[cells], outside).astype(np.uint8).reshape(own.rows, own.cols), own
+
+
 def _write_nav2(path: Path, strips: _Strips, name: str, frame: Frame) -> Nav2Scale:
     """Write the mean over the trusted courses from 0 to `HIGHEST` on a grid of the frame; return what these two stand for."""
-    grid = strips.costs.grid
-    mean = np.concatenate(
-        [strips.compute(name, first, last)[_MEAN_BAND - 1] for first, last in iterate_row_strips(grid)]
-    )
+    mean = _compute_mean(strips, name)
     known = np.isfinite(mean)
     low, high = np.percentile(mean[known], (1.0, 99.0)).tolist() if known.any() else (0.0, 1.0)
     share = (np.where(known, mean, low) - low) / max(high - low, 1e-9)
@@ -401,15 +381,28 @@ def _write_nav2(path: Path, strips: _Strips, name: str, frame: Frame) -> Nav2Sca
     meaning = (
         f"{name} a metre, {AGGREGATION}: 0 is {low:.6g} {unit}, {HIGHEST} is {high:.6g} {unit}, {LETHAL} is not crossed"
     )
-    own = frame.cover(grid)
-    cells, is_on = frame.find_cells(grid, own)
-    there = np.where(is_on, cost.reshape(-1)[cells], LETHAL).astype(np.uint8).reshape(own.rows, own.cols)
-    write_nav2_map(path, there, own, frame=frame.description, meaning=meaning)
+    write_nav2_map(path, *_resample(cost, LETHAL, strips.costs.grid, frame), frame=frame.description, meaning=meaning)
     return Nav2Scale(low, high)
 
 
+def _write_masks(directory: Path, strips: _Strips, frame: Frame) -> float:
+    """Write the masks of the keepout and the speed filter; return the speed of one step of the latter [m/s]."""
+    mean_mps, grid = _compute_mean(strips, "velocity"), strips.costs.grid
+    known = np.isfinite(mean_mps)
+    step_mps = float(mean_mps[known].max()) / 100.0 if known.any() else 0.01
+    speed = np.where(known, np.maximum(np.nan_to_num(mean_mps) / step_mps, 1.0), 0.0).astype(np.uint8)
+    masks = {
+        "keepout": (np.where(known, 0, LETHAL).astype(np.uint8), LETHAL, f"{LETHAL} is not crossed"),
+        "speed": (speed, 0, f"speed limit: value * {step_mps:.9f} m/s, {AGGREGATION}; 0: no limit"),
+    }
+    for name, (values, outside, meaning) in masks.items():
+        there = _resample(values, outside, grid, frame)
+        write_nav2_mask(directory / f"{name}.yaml", *there, frame=frame.description, meaning=meaning)
+    return step_mps
+
+
 def _compute_shares(costs: CostGrid) -> tuple[CellCounts, dict[str, float]]:
-    """Return how many cells have a cost, and the share of cells and courses that each reason holds."""
+    """Return the numbers of cells, and the share of cells and courses with each reason."""
     counts, with_cost, trusted = dict.fromkeys(Reason, 0), 0, 0
     for first, last in iterate_row_strips(costs.grid):
         bits = np.asarray(costs.reasons[:, first:last])

@@ -72,14 +72,14 @@ LANE_M = 0.7
 """Width of the strip that a robot needs, about the paper's Husky (0.67 m) [m]."""
 
 _ROUNDED = 1.0 + 1e-6
-"""Factor up to which a distance is that of training."""
+"""Factor up to which a distance equals that of training [1], for rounding."""
 
 _STRAY = 0.05
-"""Share of a lane's pixels that may be wrongly classed."""
+"""Largest share of a lane's pixels with a wrong class [1]."""
 
 
 class Reason(IntFlag):
-    """Why a metre has no cost, or one that is not to be trusted; 0 means that the model knows such ground."""
+    """Reasons for no cost, or an unreliable one, of a metre; 0: inside the training range."""
 
     OUTSIDE_MAP = 1 << 0
     """The patch reaches beyond the map; no cost."""
@@ -106,13 +106,13 @@ class Reason(IntFlag):
 
 
 NO_COST = Reason.OUTSIDE_MAP | Reason.NODATA | Reason.NOT_TRAVERSABLE | Reason.NO_MOTION
-"""With any of these there is no prediction."""
+"""Reasons without a prediction."""
 
 Bits = NDArray[np.uint16]
 
 
 def count_reasons(bits: Bits) -> dict[str, int]:
-    """Return how often each reason occurs; those that never do are left out."""
+    """Return how often each reason occurs, without those that do not."""
     counts = {flag_name(reason): int(np.count_nonzero(bits & reason)) for reason in Reason}
     return {name: count for name, count in counts.items() if count}
 
@@ -140,7 +140,7 @@ def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: Model, sour
 
 
 def _find_class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: Model, source: MapReader) -> Bits:
-    """Return what the map's classes forbid, and which of them training has not met; a model of another table takes no terrain."""
+    """Return the reasons by class: not traversable, or not in training; a model of another class table has no terrain input."""
     traversable = source.classes.traversable()
     bits = np.zeros(len(terrain), np.uint16)
     bits[~traversable[patches.terrain_class]] |= np.uint16(Reason.NOT_TRAVERSABLE)
@@ -163,16 +163,16 @@ def _find_class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: Mod
 
 
 BATCH = 4_096
-"""Metres judged together: 26 MB of patches."""
+"""Metres in a batch: 26 MB of patches."""
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentPredictions:
-    """What is said of N metres, shape (N,): `Reason` bits, predictions (NaN without a cost), and what the ground is.
+    """Predictions for N metres, shape (N,): `Reason` bits, costs (NaN without a prediction), and the ground.
 
-    Predictions are centred (`tcpipe.cost.prediction_errors`); ``duration_std_s`` and ``energy_std_joule`` are what the model states of a
-    metre: 0 where it states none. ``velocity_mps`` is horizontal, whichever velocity the model predicts: a metre of the map takes its
-    inverse. ``height_m`` is that of the metre's middle, NaN where the map has none.
+    Predictions are centred (`tcpipe.cost.prediction_errors`); ``duration_std_s`` and ``energy_std_joule`` are the standard deviations that
+    the model states for a metre, 0 without one. ``velocity_mps`` is horizontal, whichever velocity the model predicts. ``height_m`` is that
+    of the metre's middle, NaN if the map has none.
     """
 
     reasons: Bits
@@ -191,13 +191,11 @@ def iterate_predictions(
     source: MapReader,
     batches: Iterable[PatchFrames],
     *,
-    ask: bool = True,
     turn_radpm: Floats | None = None,
 ) -> Iterator[SegmentPredictions]:
-    """Yield what is said of each batch of frames, in order; tiles of the map are kept from batch to batch.
+    """Yield the predictions of each batch of frames, in order; tiles of the map are kept from batch to batch.
 
-    Without ``ask`` the ground is judged alone: no predictions. ``turn_radpm`` is how far a metre of each frame turns, of all batches one
-    after another; without it all turn as usual.
+    ``turn_radpm`` is the turn of a metre of each frame, of all batches one after another; without it all turn as usual.
     """
     source, side, px = (
         source.select({*PAPER_LAYERS, *model.card.layout.layers}),
@@ -213,7 +211,7 @@ def iterate_predictions(
 
     def judge(patches: Patches, on_map: NDArray[np.bool_], first: int) -> SegmentPredictions:
         bits = find_reasons(patches, on_map, model, source)
-        asked = (bits & NO_COST == 0) & ask
+        asked = bits & NO_COST == 0
         turns = np.full(on_map.size, np.nan) if turn_radpm is None else turn_radpm[first : first + on_map.size]
         said = predict_patches(model, patches, asked, turns)
         power_watt, velocity_mps = correction.apply(said.mean[:, 0], said.mean[:, 1], patches.terrain_class)
@@ -270,7 +268,7 @@ def predict_patches(model: Model, patches: Patches, asked: NDArray[np.bool_], tu
 def predict_segments(
     model: Model, source: MapReader, frames: PatchFrames, turn_radpm: Floats | None = None
 ) -> SegmentPredictions:
-    """Return what is said of all frames, in batches of `BATCH`; ``turn_radpm`` is how far a metre of each turns."""
+    """Return the predictions of all frames, in batches of `BATCH`; ``turn_radpm`` is the turn of a metre of each."""
     count = len(frames.centre_xy_m)
     starts = range(0, max(count, 1), BATCH)
     batches = (frames.rows(np.arange(first, min(first + BATCH, count))) for first in starts)

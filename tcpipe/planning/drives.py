@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.cost.adaptation import AdaptedErrors, Metres, Run, compare_adaptations, predict
+from tcpipe.cost.adaptation import Metres, Run, predict
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
-from tcpipe.errors import DatasetError, ModelError, UsageError, clean_lines
+from tcpipe.errors import ModelError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear
 from tcpipe.formats.dataset_card import list_shifts
 from tcpipe.formats.finding_lines import format_findings, list_verdict
@@ -43,7 +43,7 @@ from tcpipe.terrain.tiles import MapReader, find_map_projection
 Floats = NDArray[np.float64]
 
 UNCERTAIN, UNLABELLED = "position_uncertain", "no_label"
-"""Why a segment is not compared, besides `Reason`."""
+"""Reasons against the comparison of a segment, besides `Reason`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,18 +57,18 @@ class IntervalComparison:
 
     @property
     def off_percent(self) -> float:
-        """Return how far the prediction is off."""
+        """Return the error of the prediction [%]."""
         return 100.0 * (self.predicted / self.measured - 1.0) if self.measured else float("nan")
 
     @property
     def held(self) -> bool | None:
-        """Return whether the interval holds what was measured."""
+        """Return whether the measured sum is inside the interval."""
         return None if self.low is None or self.high is None else self.low <= self.measured <= self.high
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriveCost:
-    """A drive: what was driven, what of it can be compared, what that took and was predicted to take."""
+    """A drive: distances driven and compared, and time and energy of the compared segments, measured and predicted."""
 
     run_id: str
     log: str
@@ -80,7 +80,7 @@ class DriveCost:
     compared_m: float
     """Distance of segments with labels, on ground inside the training range [m]."""
     rest_m: Mapping[str, float]
-    """The other segments, by why they are not compared; a metre may have several reasons."""
+    """Distance of the other segments by reason; a segment may have several [m]."""
     samples_in_training: int
     """Training samples of this drive: a drive with any is no holdout."""
     near_training_percent: float
@@ -96,7 +96,7 @@ class DriveCost:
 
 
 def find_drive(store: Store, log: str) -> StoredRun:
-    """Return the run of a log, by the path or URL of the log, RUN or RUN/RECIPE; `UsageError` if there is none, or several recipes."""
+    """Return the run of a log, by the path or URL of the log, RUN or RUN/RECIPE; `UsageError` without one, or with several."""
     state = store.scan()
     found = store.find_runs(log, state) or [
         run for run in store.runs(state) if make_absolute(log) in run.facts.log.paths
@@ -111,22 +111,8 @@ def find_drive(store: Store, log: str) -> StoredRun:
     return found[0]
 
 
-@dataclass(frozen=True, slots=True)
-class DrivenMetres:
-    """All segments of a run in order, predicted and measured, with why each is not to be compared; nothing where it is."""
-
-    run: Run
-    reasons: Sequence[Sequence[str]]
-
-    @property
-    def is_good(self) -> NDArray[np.bool_]:
-        """Return which segments are to be compared, shape (N,)."""
-        return np.array([not why for why in self.reasons], np.bool_)
-
-    @property
-    def names(self) -> list[str]:
-        """Return all reasons."""
-        return sorted({name for why in self.reasons for name in why})
+Reasons = Sequence[Sequence[str]]
+"""Reasons against the comparison of each segment; empty if it is compared."""
 
 
 def predict_run(
@@ -137,11 +123,11 @@ def predict_run(
     gnss_crs: str | None = None,
     sample: SampleConfig | None = None,
     shift: Sequence[float] = (0.0, 0.0, 0.0),
-) -> DrivenMetres:
-    """Return what a model says of a run's segments, on their ground by the map, and what was measured.
+) -> tuple[Run, Reasons]:
+    """Return the predictions and labels of a run's segments in order, and the reasons against the comparison of each.
 
-    ``gnss_crs`` is of the fixes (None: as the run was ingested); ``sample`` says how well a place must be known; ``shift`` moves the run
-    on the map (x, y) and adds to its standard deviation [m].
+    ``gnss_crs`` is of the fixes (None: as the run was ingested); ``sample`` limits the position's standard deviation; ``shift`` moves the
+    run on the map (x, y) and adds to its standard deviation [m].
     """
     check_model(model, source)
     segments = run.segments().sort_by("start_ns")
@@ -177,7 +163,7 @@ def predict_run(
             said.reasons, uncertain, np.isfinite(measured + values["duration_s"]), strict=True
         )
     ]
-    return DrivenMetres(Run(run.run_id, metres), reasons)
+    return Run(run.run_id, metres), reasons
 
 
 def collect_runs(
@@ -193,16 +179,19 @@ def collect_runs(
     shifts, collected = find_shifts(store, source, recipe, runs, data)[0], list[Run]()
     for run in runs:
         shift = shifts.get(run.run_id, (0.0, 0.0, 0.0))
-        found = predict_run(model, source, run, sample=recipe.sample, shift=shift)
-        if not found.is_good.any():
-            named = ", ".join(found.names).replace("_", " ") or "it has no segments"
+        found, reasons = predict_run(model, source, run, sample=recipe.sample, shift=shift)
+        is_good = np.array([not why for why in reasons], np.bool_)
+        if not is_good.any():
+            named = ", ".join(_list_names(reasons)).replace("_", " ") or "it has no segments"
             raise UsageError(
                 f"run {run.run_id}: no labelled segment on ground that {model.name} knows to adapt it by ({named})"
             )
-        collected.append(
-            Run(run.run_id, {name: metres.take(found.is_good) for name, metres in found.run.metres.items()})
-        )
+        collected.append(Run(run.run_id, {name: metres.take(is_good) for name, metres in found.metres.items()}))
     return collected
+
+
+def _list_names(reasons: Reasons) -> list[str]:
+    return sorted({name for why in reasons for name in why})
 
 
 def find_shifts(
@@ -223,10 +212,10 @@ def find_shifts(
 def compute_drive_cost(
     model: Model, source: MapReader, run: StoredRun, data: Dataset, *, log: str, shifts: Shifts | None = None
 ) -> DriveCost:
-    """Return what a drive took beside what a model says of it.
+    """Return the measured and predicted cost of a drive.
 
-    ``data`` is the dataset that the model was trained on: what of the drive it has seen; ``log`` what the user calls the drive;
-    ``shifts`` are of runs on the map. `ModelError`, `UsageError`: it is of another robot, or has no segments.
+    ``data`` is the dataset that the model was trained on; ``log`` is the user's name of the drive; ``shifts`` are of runs on the map.
+    `ModelError`, `UsageError`: it is of another robot, or has no segments.
     """
     if run.facts.robot != model.card.robot:
         raise ModelError(f"{log}: is of robot {run.facts.robot}, model {model.name} of {model.card.robot}")
@@ -234,13 +223,14 @@ def compute_drive_cost(
     if not segments.num_rows:
         raise UsageError(f"{log}: run {run.run_id} has no segments to compare; see 'tcpipe report' for why")
     recipe, shift = data.card.recipe, (shifts or {}).get(run.run_id, (0.0, 0.0, 0.0))
-    found = predict_run(model, source, run, gnss_crs=recipe.read.gnss_crs, sample=recipe.sample, shift=shift)
-    errors, trained, length_m = model.errors, data["train"], found.run.metres["energy"].length_m
+    found, reasons = predict_run(model, source, run, gnss_crs=recipe.read.gnss_crs, sample=recipe.sample, shift=shift)
+    errors, trained, length_m = model.errors, data["train"], found.metres["energy"].length_m
     near = are_near(
         compute_middles([to_floats(segments, name) for name in PLACES]),
         compute_middles([trained.column(name) for name in PLACES]), within_m=CLOSE * model.card.chord_m, in_degrees=True,
     )  # fmt: skip
-    good = {name: metres.take(found.is_good) for name, metres in found.run.metres.items()}
+    is_good = np.array([not why for why in reasons], np.bool_)
+    good = {name: metres.take(is_good) for name, metres in found.metres.items()}
     sums = {
         name: IntervalComparison(
             float(metres.measured.sum()), float(metres.predicted.sum()),
@@ -250,8 +240,8 @@ def compute_drive_cost(
     }  # fmt: skip
     return DriveCost(
         run_id=run.run_id, log=log, map=source.name, driven_m=run.facts.driven_m,
-        segments_m=float(length_m.sum()), compared_m=float(length_m[found.is_good].sum()),
-        rest_m={name: float(length_m[[name in why for why in found.reasons]].sum()) for name in found.names},
+        segments_m=float(length_m.sum()), compared_m=float(length_m[is_good].sum()),
+        rest_m={name: float(length_m[[name in why for why in reasons]].sum()) for name in _list_names(reasons)},
         samples_in_training=int((trained.column("run_id").astype(np.str_) == run.run_id).sum()),
         near_training_percent=100.0 * float(near.mean()),
         duration_s=sums["duration"], energy_joule=sums["energy"], label_energy=model.card.label_energy,
@@ -259,7 +249,7 @@ def compute_drive_cost(
 
 
 def format_drive(drive: DriveCost) -> list[str]:
-    """Return what a drive shows, as plain lines."""
+    """Return a drive as plain lines."""
     rest = ", ".join(f"{metres:.0f} m {name.replace('_', ' ')}" for name, metres in drive.rest_m.items())
     lines = [
         f"{drive.run_id}: {drive.compared_m:.0f} of {drive.driven_m:.0f} m driven are compared; {drive.segments_m:.0f} m are in segments"
@@ -285,15 +275,13 @@ JSON = "drives.json"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drives:
-    """All of drives.json; ``duration_s`` and ``energy_joule`` are over all drives that were held back."""
+    """All of drives.json."""
 
     kind: str = "tcpipe drives"
     tcpipe_version: str = __version__
     model: str
     model_checksum: str
     drives: tuple[DriveCost, ...]
-    duration_s: IntervalComparison
-    energy_joule: IntervalComparison
     findings: tuple[Finding, ...]
     verdict: Verdict
 
@@ -306,16 +294,8 @@ class DrivesResult:
     values: Drives
 
     def __str__(self) -> str:
-        """Return each drive and their sum, as plain lines."""
+        """Return each drive as plain lines."""
         lines = [line for drive in self.values.drives for line in format_drive(drive)]
-        held = [drive for drive in self.values.drives if drive.held_back]
-        if len(held) > 1:
-            of_both = {"time": self.values.duration_s, "energy": self.values.energy_joule}
-            hits = [sum(getattr(drive, name).held is True for drive in held) for name in ("duration_s", "energy_joule")]
-            sums = ", ".join(f"{called} {comparison.off_percent:+.1f} %" for called, comparison in of_both.items())
-            lines.append(
-                f"all {len(held)} drives held back: {sums}; intervals cover {hits[0]} of the times and {hits[1]} of the energies"
-            )
         lines += [f"verdict: {line}" for line in list_verdict(self.values.verdict, PREDICTED)]
         lines += format_findings(self.values.findings)
         return clean_lines((*lines, f"{self.path}/{JSON}"))
@@ -324,10 +304,9 @@ class DrivesResult:
 def evaluate_drives(
     model: Model, data: Dataset, source: MapFile, logs: Sequence[str], *, store: str | Path, out: str | Path
 ) -> DrivesResult:
-    """Compare drives with what a model says of them and write ``drives.json`` into the directory ``out``, or to a URL.
+    """Compare drives with a model's predictions and write ``drives.json`` into the directory ``out``, or to a URL.
 
-    Where the dataset's runs were moved onto their map (``sample.align``), drives are moved together with
-    those of them that are in the store, or a finding says why not.
+    If the dataset's runs were moved onto their map (``sample.align``), drives are moved together with those in the store.
 
     Raises `ModelError`, `MapError` or `UsageError` where the model, the map or a drive cannot be used, or ``out`` is a file.
     """
@@ -338,30 +317,23 @@ def evaluate_drives(
         compute_drive_cost(model, source, run, data, log=log, shifts=shifts)
         for run, log in zip(runs, logs, strict=True)
     )
-    held = [drive for drive in found if drive.held_back]
     findings = (*_find_doubts(found, Subject("model", model.name)), *moved)
     values = Drives(
         model=model.name, model_checksum=model.checksum, drives=found,
-        duration_s=_sum([drive.duration_s for drive in held]), energy_joule=_sum([drive.energy_joule for drive in held]),
         findings=findings, verdict=judge(findings),
     )  # fmt: skip
-    return DrivesResult(write_values(out, JSON, values), values)
-
-
-def write_values(out: str | Path, name: str, values: Drives | Adaptation) -> str:
-    """Write a document into the directory ``out``, or to a URL, and return where it is."""
     if not is_url(out):
         clear(Path(out))
         if Path(out).exists() and not Path(out).is_dir():
-            raise UsageError(f"{out}: is a file, expected a directory to write {name} into")
-    with open_output(out, name) as place:
+            raise UsageError(f"{out}: is a file, expected a directory to write {JSON} into")
+    with open_output(out, JSON) as place:
         place.mkdir(parents=True, exist_ok=True)
-        write_json(place / name, values)
-    return require_card(str(out), [name]).place.where()
+        write_json(place / JSON, values)
+    return DrivesResult(require_card(str(out), [JSON]).place.where(), values)
 
 
 def check_origin(model: Model, data: Dataset) -> None:
-    """Raise `ModelError` if a model was trained on another dataset, which does not show what it has seen."""
+    """Raise `ModelError` if a model was trained on another dataset: then its training samples are unknown."""
     card = model.card
     if compute_dataset_checksum(data.card) != card.dataset.sha256:
         raise ModelError(
@@ -370,65 +342,8 @@ def check_origin(model: Model, data: Dataset) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Adaptation:
-    """All of adaptation.json: errors on the rest of drives, after the first metres of each are known."""
-
-    kind: str = "tcpipe adaptation"
-    tcpipe_version: str = __version__
-    model: str
-    known_m: tuple[float, ...]
-    errors: tuple[AdaptedErrors, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class AdaptationResult:
-    """Result and its path; the command prints its ``str``."""
-
-    path: str
-    values: Adaptation
-
-    def __str__(self) -> str:
-        """Return the errors by known metres, as plain lines."""
-        return clean_lines((*map(str, self.values.errors), f"wrote {self.path}/adaptation.json"))
-
-
-def evaluate_adaptation(
-    model: Model,
-    data: Dataset,
-    source: MapFile,
-    logs: Sequence[str],
-    known_m: Sequence[float],
-    *,
-    store: str | Path,
-    out: str | Path,
-) -> AdaptationResult:
-    """Predict the rest of each drive after its first metres are known, and write ``adaptation.json`` into the directory ``out``."""
-    if not known_m or not all(0.0 <= metres < np.inf for metres in known_m):
-        raise UsageError(f"adapt: {known_m} are no metres of a run; expected some, as 0, 10, 50")
-    if (errors := model.errors) is None:
-        raise ModelError(
-            f"{model.name}: has too few held-out samples to state errors, which an adaptation weighs; train on more"
-        )
-    runs, known = collect_runs(model, source, open_store(store), logs, data), tuple(sorted(set(known_m)))
-    found = tuple(compare_adaptations({name: errors[name] for name in ("energy", "duration")}, runs, known))
-    if not found:
-        longest_m = max(float(run.metres["energy"].length_m.sum()) for run in runs)
-        raise DatasetError(
-            f"no drive has {max(known_m):g} m of labelled segments and more to predict, the longest has {longest_m:.0f} m; "
-            "give smaller values to --adapt"
-        )
-    values = Adaptation(model=model.name, known_m=known, errors=found)
-    return AdaptationResult(write_values(out, "adaptation.json", values), values)
-
-
-def _sum(parts: Sequence[IntervalComparison]) -> IntervalComparison:
-    """Return sums over drives; how errors of drives go together is not known, so there is no interval."""
-    return IntervalComparison(sum(part.measured for part in parts), sum(part.predicted for part in parts), None, None)
-
-
 def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Finding]:
-    """Yield what drives show of a model's sums and intervals, and which drives show nothing."""
+    """Yield errors of sums and intervals, and the drives that are not compared."""
     for drive in drives:
         if not drive.held_back:
             yield make_finding(

@@ -43,15 +43,15 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathTotals:
-    """What a path costs in all, over the path segments that have a cost, by which model, on which map, for which robot."""
+    """Totals of a path over the path segments with a cost, by model, map and robot."""
 
     model: str
     map: str
     robot: str
     label_energy: str = "total"
-    """``total`` or ``net``: which energy it is."""
+    """Kind of energy: ``total`` or ``net``."""
     adapted_by: str | None = field(default=None, metadata=LEFT_OUT)
-    """Run whose metres adapted the model."""
+    """Run that adapted the model."""
     length_m: float
     path_segments: int
     path_segments_without_cost: int
@@ -59,15 +59,15 @@ class PathTotals:
     energy_joule: float | None
     """None for a model of time alone."""
     turn_rad: float = 0.0
-    """How far it turns, both ways counted."""
+    """Sum of turns in both directions."""
     turn_energy_joule: float | None = None
-    """Of the energy, what turns cost beyond those of the segments that the model knows; None where its robot's physics is not known, and
-    where the model was told the turns: its energies hold them."""
+    """Energy of turns beyond those of the training segments; None without the robot's physics, and for models with turns as input, whose
+    energies include it."""
     duration_interval_s: tuple[float, float] | None
-    """Of what the robot's own sensors will measure; None, as that of energy, without held-out samples."""
+    """Interval of what the robot's own sensors will measure; None, as that of energy, without held-out samples."""
     energy_interval_joule: tuple[float, float] | None
     energy_common_std_joule: float | None = None
-    """Standard deviation of what these sensors measure against the truth (gain and zero of the power sensor); in no interval."""
+    """Standard deviation of the sensors' measurement (gain and zero of the power sensor); in no interval."""
     coverage: float = COVERAGE
     """Share of drives that an interval is to cover."""
     held_out_samples: int = 0
@@ -88,12 +88,12 @@ class PathTotals:
 
 @dataclass(frozen=True, slots=True)
 class PathCost:
-    """What a path costs; ``path_segments`` is a checked table (`PATH_SEGMENTS`), one row a path segment in order."""
+    """Cost of a path; ``path_segments`` is a checked table (`PATH_SEGMENTS`), one row a path segment in order."""
 
     path_segments: pa.Table
     totals: PathTotals
     errors: Mapping[str, SumDistribution] | None
-    """Of ``duration`` [s] and ``energy`` [J] in all; None without held-out samples."""
+    """Distributions of the total ``duration`` [s] and ``energy`` [J]; None without held-out samples."""
 
 
 def compute_path_cost(
@@ -105,17 +105,17 @@ def compute_path_cost(
     known: Run | None = None,
     shortest_m: float | None = None,
 ) -> PathCost:
-    """Return what a path costs, by the model as it is or adapted by the metres of a run.
+    """Return the cost of a path by the model, adapted by the metres of a run if one is given.
 
     Parameters
     ----------
-    model, source : who predicts, and the map.
+    model, source : the model and the map.
     lonlat_deg : the path's points, WGS 84, shape (P, 2).
-    where : what the path is called in errors.
-    known : metres of a run of the robot that is to drive the path.
-    shortest_m : the least length of a path, without it that of a path segment.
+    where : name of the path in errors.
+    known : metres of a run of the robot that will drive the path.
+    shortest_m : the least length of a path; None: that of a path segment.
 
-    Raises `PathError` where the path is too short, or nowhere on the map; `ModelError` where the map lacks what the model needs.
+    Raises `PathError` if the path is too short or off the map; `ModelError` if the map lacks a layer of the model.
     """
     check_model(model, source, needs_energy=False)
     segments = _cut_into_segments(source, lonlat_deg, chord_m=model.card.chord_m, where=where, shortest_m=shortest_m)
@@ -153,7 +153,7 @@ def _cut_into_segments(
 
 
 def find_added_turning(model: Model) -> Turning | None:
-    """Return what turns cost beside what a model predicts; None where it was told them, or the robot's physics is not known."""
+    """Return the cost of turns besides a model's predictions; None if turns are an input, or without the robot's physics."""
     return None if model.takes_turns else find_turning(model.card.physics, model.card.class_table)
 
 
@@ -238,7 +238,7 @@ def _sum_costs(  # noqa: PLR0917
 
 
 def _locate_segments(source: MapReader, segments: PathSegments) -> dict[str, Floats]:
-    """Return where the path segments lie, as columns."""
+    """Return columns of the places of path segments."""
     projection = find_projection(source)
     start, end = (projection.inverse(xy_m) for xy_m in (segments.start_xy_m, segments.end_xy_m))
     azimuth_deg, _, _ = Geod(ellps="WGS84").inv(start[:, 0], start[:, 1], end[:, 0], end[:, 1])
@@ -255,7 +255,7 @@ def _locate_segments(source: MapReader, segments: PathSegments) -> dict[str, Flo
 
 
 def describe_off_map(source: MapReader, where: str, lonlat_deg: Floats) -> str:
-    """Say that points, shape (P, 2), are not on a map, where that lies, and whether their axes are swapped."""
+    """Return a message for points, shape (P, 2), off the map: its extent, and whether their axes are swapped."""
     west, south, east, north = compute_area(find_projection(source).target, source.grid.bounds_m)
     lat, lon = lonlat_deg.T
     swapped = bool(((lon >= west) & (lon <= east) & (lat >= south) & (lat <= north)).any())

@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.tables.options import MAP, MODEL, PHYSICS, PREDICTOR, SPEED, STORE, Option, Range, option, required
+from tcpipe.tables.options import MAP, MODEL, PREDICTOR, SPEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.planning.plan import Objective
@@ -26,7 +26,7 @@ _CELL_SIZE = Option(
 
 @dataclass(frozen=True, slots=True)
 class PredictPathOptions:
-    """Which path is predicted with which model, on which map."""
+    """Model, map and path of a prediction."""
 
     model: str | Path = required(MODEL)
     path: str | Path = required(Option("GeoJSON LineString (WGS84, lon before lat).", (), "input_file", "FILE"))
@@ -35,7 +35,6 @@ class PredictPathOptions:
     out: str | Path | None = option(
         None, Option("Write the table of path segments: .csv or .geojson.", (), "output_file", "FILE")
     )
-    physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
     adapt: str | Path | None = option(
@@ -50,7 +49,7 @@ class PredictPathOptions:
 
 @dataclass(frozen=True, slots=True)
 class PlanPathOptions:
-    """Between which points a path is planned, by which model, and what is to be least."""
+    """End points, model and objective of a plan."""
 
     model: str | Path = required(MODEL)
     start: tuple[float, float] = required(Option("Start of the path (WGS84, degrees).", ("--from",), "lonlat"))
@@ -59,13 +58,13 @@ class PlanPathOptions:
     objective: Objective = option("energy", Option("Quantity to minimise.", (), ("energy", "time", "distance")))
     map_name: str | None = option(None, MAP)
     out: str | Path = option("plan.geojson", Option("Write the path as GeoJSON.", (), "output_file", "FILE"))
-    picture: str | Path | None = option(
-        None, Option("Draw the paths of all three objectives on the map (.png).", (), "output_file", "FILE")
-    )
     cost_map: str | Path | None = option(
         None,
         Option(
-            "Cost map of this model and map; without one, only the necessary cells are predicted.", (), "sealed", "DIR"
+            "Cost map of this model and map; without one, the cells of all short paths are predicted.",
+            (),
+            "sealed",
+            "DIR",
         ),
     )
     cell_size_m: float = option(1.0, _CELL_SIZE)
@@ -87,13 +86,12 @@ class PlanPathOptions:
         None,
         Option("Print the probability that this energy suffices: 300Wh, 500kJ.", ("--budget",), "energy", "ENERGY"),
     )
-    round_trip: bool = option(False, Option("Plan the way back, too; a budget is for both.", ("--return",)))
-    physics_from: str | Path | None = option(None, PHYSICS)
+    origin_deg: tuple[float, float] | None = option(None, _ORIGIN)
     speed_mps: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
     store: str | Path = option("tcpipe-store", STORE)
     on_step: Callable[[int, int], None] | None = None
-    """Called with how many blocks of how many are done, in each round of the search."""
+    """Called with how many blocks of how many are predicted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,14 +111,11 @@ class CostMapOptions:
 
 @dataclass(frozen=True, slots=True)
 class RouteGraphOptions:
-    """Which graph of Nav2's route server gets the costs of which model, on which map."""
+    """Graph of Nav2's route server, model and map of the costs of its edges."""
 
     model: str = required(MODEL)
+    graph: str = required(Option("Graph (GeoJSON, metres).", (), "input_file", "FILE"))
     _: KW_ONLY
-    graph: str | None = option(
-        None,
-        Option("Graph (GeoJSON, metres); without one, proposed from the runs of the store.", (), "input_file", "FILE"),
-    )
     out: str = option("route-graph.geojson", Option("Write the graph.", (), "output_file", "FILE"))
     origin_deg: tuple[float, float] | None = option(None, _ORIGIN)
     two_way: bool = option(False, Option("Add an edge back for each that has none."))

@@ -1,18 +1,18 @@
-"""The least-cost path between two points (paper, section I), proved to be the best without predicting the whole map.
+"""The least-cost path between two points (paper, section I).
 
-A path over a point p is at least as long as the straight lines start-p-goal, so a path shorter than a known one lies in an ellipse. The
-search judges the ground in this ellipse without predictions and enlarges it until the shortest path is proved. Then it asks the model about
-the ground of the shortest path and some cells of every class, and then about cells that could lie on a better path, until there are none.
+A path over a point p is at least as long as the straight lines start-p-goal, so an ellipse contains every path shorter than a bound.
+Without a cost map the model predicts the cells of the ellipse of all paths up to `DETOUR` times as long as the shortest, and the search
+uses these; with a cost map it uses all cells.
 
-The grid knows cells, and a path is judged by its metres. So the search offers several paths: of each objective, with turns and without, as
-steps and as straight lines, and for ``risk`` with several multiples of the standard deviation of a cell added to its cost. The path
+The search knows cells, and a path is judged by its metres. So the search offers several paths: of each objective, with turns and without,
+as steps and as straight lines, and for ``risk`` with several multiples of the standard deviation of a cell added to its cost. The path
 returned is the one that costs least as `tcpipe predict-path` predicts it.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -29,8 +29,6 @@ from tcpipe.planning.path_cost import PathCost, PathTotals, compute_path_cost, d
 from tcpipe.planning.search import (
     LeastCostPath,
     Steps,
-    compute_least_costs,
-    compute_steps_within,
     find_best_potential,
     find_least_cost_paths,
     find_turning,
@@ -49,35 +47,39 @@ Objective = Literal["energy", "time", "distance"]
 
 OBJECTIVES: tuple[Objective, ...] = ("energy", "time", "distance")
 
-_FIRST = 1.3
-"""The first ellipse is of all points that make the straight way no longer than so many times."""
+DETOUR = 1.3
+"""Length of a path over that of the shortest [1], up to which the search without a cost map finds the best."""
+
+_GRID = 1.03
+"""Length of a path of 16 courses over that of a straight line, at most [1]."""
 
 _GROWTH = 1.5
+"""Factor by which the ellipse grows while no path is found [1]."""
 
 _CAUTIONS = (0.5, 1.0, 2.0)
-"""Standard deviations of a cell that are added to its cost, for paths of little risk."""
-
-_FEWEST_ASKED = 512
-"""Cells asked about together, at least: a few seconds, more than finding the next takes."""
+"""Standard deviations of a cell that are added to its cost, for paths of little risk [1]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanTotals(PathTotals):
-    """What a planned path costs in all, and how it was found."""
+    """Totals of a planned path, and how it was found."""
 
     objective: Objective
-    """What it is the least of."""
+    """The quantity that is minimised."""
     allow_extrapolation: bool
     finalists: int
     """Paths that were judged; this one is the best of them."""
     predicted_cells: int
-    """Cells that the model was asked about."""
+    """Cells that the model predicted."""
     negative_steps: int
-    """Steps that give back more than height explains, taken as free."""
+    """Steps that gain more energy than their height explains; they cost nothing."""
     risk: float | None = None
     """Probability with which the path takes no more than ``risk_cost``, by which it was chosen; None: by its prediction."""
     risk_cost: float | None = None
     """In the objective's unit."""
+    budget_joule: float | None = None
+    budget_probability: float | None = None
+    """Probability that the budget suffices; None without a budget, or if some path segment has no cost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +89,8 @@ class Plan:
     Attributes
     ----------
     lonlat_deg, xy_m : its points, WGS 84 and in the map's CRS, shape (P, 2); from the start as given to the goal as given.
-    cost : what `tcpipe predict-path` says of it.
-    totals : that in all, and how it was found.
+    cost : as `tcpipe predict-path` predicts it.
+    totals : its totals, and how it was found.
     """
 
     lonlat_deg: Floats
@@ -97,59 +99,65 @@ class Plan:
     totals: PlanTotals
 
 
-def plan_paths(
+def plan_path(
     survey: LazyCostGrid,
     start_deg: Floats,
     goal_deg: Floats,
-    objectives: Sequence[Objective],
+    objective: Objective,
     *,
     allow_extrapolation: bool = False,
     risk: float | None = None,
+    budget_joule: float | None = None,
     step: Callable[[int, int], None] = lambda _, __: None,
-) -> dict[Objective, Plan]:
-    """Return the least-cost path from a point to another of each objective.
+) -> Plan:
+    """Return the least-cost path from a point to another.
 
     Parameters
     ----------
-    survey : the map and the model, and what is known so far; it learns what it lacks.
+    survey : the map and the model, and the costs known so far; missing ones are predicted.
     start_deg, goal_deg : longitude and latitude, WGS 84 [deg], shape (2,).
-    objectives : what is to be least.
-    allow_extrapolation : whether ground unlike any that the model was trained on may be crossed.
-    risk : the probability with which a path shall take no more than what is least; None: its prediction is least.
-    step : is told how many blocks of how many are looked at, or predicted, in each round.
+    objective : the quantity to minimise.
+    allow_extrapolation : whether to cross ground outside the training range.
+    risk : minimise what the path does not exceed with this probability; None: minimise its prediction.
+    budget_joule : state the probability that this energy suffices.
+    step : called with how many blocks of how many are predicted.
 
-    Raises `PathError` where an end is off the map or on closed ground, or no path connects them; `ModelError` where the model states no
-    errors for ``risk``.
+    Raises `PathError` if an end is off the map or on closed ground, or no path connects them; `ModelError` if the model states no errors
+    for ``risk`` or a budget.
     """
     errors = survey.model.errors
-    if risk is not None and errors is None:
+    if (risk is not None or budget_joule is not None) and errors is None:
         raise ModelError(
             f"{survey.model.name}: has too few held-out samples for errors, which --risk and --budget need"
         )
-    ends_xy_m = find_projection(survey.source).forward(np.stack([start_deg, goal_deg]))
-    search = _Search(survey, ends_xy_m, np.stack([start_deg, goal_deg]), allow_extrapolation, step)
+    ends_deg = np.stack([start_deg, goal_deg])
+    projection = find_projection(survey.source)
+    search = _Search(survey, projection.forward(ends_deg), ends_deg, allow_extrapolation, step)
     search.check_ends()
-    lines, negative = search.find_finalists(objectives, None if risk is None else errors)
-    lonlats = [find_projection(survey.source).inverse(xy_m) for xy_m in lines]
+    search.predict_ground()
+    lines, negative = search.find_finalists(objective, None if risk is None else errors)
+    lonlats = [projection.inverse(xy_m) for xy_m in lines]
     costs = [compute_path_cost(survey.model, survey.source, lonlat, where="the planned path") for lonlat in lonlats]
-    predicted_cells = int(np.count_nonzero(survey.predicted))
-    plans = {}
-    for objective in objectives:
-        of_all = [_judge(cost, objective, risk) for cost in costs]
-        best = min((cost.totals.path_segments_without_cost, of_all[at], at) for at, cost in enumerate(costs))[-1]
-        totals = convert_record(
-            costs[best].totals,
-            PlanTotals,
-            objective=objective,
-            allow_extrapolation=allow_extrapolation,
-            finalists=len(lines),
-            predicted_cells=predicted_cells,
-            negative_steps=negative.get(objective, 0),
-            risk=risk,
-            risk_cost=None if risk is None else of_all[best],
-        )
-        plans[objective] = Plan(lonlats[best], lines[best], costs[best], totals)
-    return plans
+    judged = [_judge(cost, objective, risk) for cost in costs]
+    best = min((cost.totals.path_segments_without_cost, judged[at], at) for at, cost in enumerate(costs))[-1]
+    found = costs[best]
+    probability = None
+    if budget_joule is not None and found.errors is not None and found.totals.complete:
+        probability = found.errors["energy"].compute_probability(budget_joule)
+    totals = convert_record(
+        found.totals,
+        PlanTotals,
+        objective=objective,
+        allow_extrapolation=allow_extrapolation,
+        finalists=len(lines),
+        predicted_cells=int(np.count_nonzero(survey.predicted)),
+        negative_steps=negative,
+        risk=risk,
+        risk_cost=None if risk is None else judged[best],
+        budget_joule=budget_joule,
+        budget_probability=probability,
+    )
+    return Plan(lonlats[best], lines[best], found, totals)
 
 
 def _judge(cost: PathCost, objective: Objective, risk: float | None) -> float:
@@ -213,9 +221,28 @@ class _Search:
         if problems:
             raise PathError(*problems)
 
+    def predict_ground(self) -> None:
+        """Predict the cells of all paths up to `DETOUR` times as long as the shortest; `PathError` if there is no path."""
+        straight_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]) * self._metres().max())
+        bound_m, survey = straight_m * DETOUR, self.survey
+        while True:
+            ellipse = self._ellipse(bound_m)
+            if count := int(np.count_nonzero(ellipse & ~survey.predicted)):
+                logger.info(
+                    "predicting %d cells, %d courses each; a cost map (tcpipe cost-map) saves that", count, COURSES
+                )
+                survey.predict(ellipse, self.step)
+            self._check_open()
+            paths = self._find("distance")[1]
+            if paths and (paths[0].cost * DETOUR <= bound_m * _GRID or ellipse.all()):
+                return
+            if ellipse.all():
+                raise PathError(self._describe_no_path())
+            bound_m = max(bound_m * _GROWTH, paths[0].cost * DETOUR if paths else 0.0)
+
     def _check_open(self) -> None:
         """Raise `PathError` for an end from which no course can be driven; both at once."""
-        bits = self.survey.costs.reasons.reshape(len(self.survey.costs.reasons), -1)[:, self._cells]
+        bits = self.survey.costs.reasons.reshape(COURSES, -1)[:, self._cells]
         forbidden, problems = BARRED if self.allow_extrapolation else 0xFFFF, []
         for label, own in zip(("--from", "--to"), (bits & forbidden).T, strict=True):
             if own.all():
@@ -244,14 +271,13 @@ class _Search:
     def _find(
         self,
         objective: Objective,
-        known: Mask,
         class_id: Classes | None = None,
         errors: Errors | None = None,
         caution: float = 0.0,
     ) -> tuple[Steps, tuple[LeastCostPath, ...]]:
-        """Return the steps over known cells and the best paths over them; with the cells' classes, that with turns comes first."""
+        """Return the steps over predicted cells and the best paths over them; with the cells' classes, that with turns comes first."""
         costs, (start, goal) = self.survey.costs, self._cells.tolist()
-        open_ = costs.open_courses(allow_extrapolation=self.allow_extrapolation) & known
+        open_ = costs.open_courses(allow_extrapolation=self.allow_extrapolation) & self.survey.predicted
         per_metre = costs.per_metre(objective)
         if errors is not None and class_id is not None:
             for course in per_metre:
@@ -264,106 +290,23 @@ class _Search:
         turning = find_turning(self.survey.model.card.physics, self.survey.model.card.class_table)
         return steps, find_least_cost_paths(steps, find_best_potential(steps), start, goal, turning, class_id)
 
-    def find_finalists(
-        self, objectives: Sequence[Objective], errors: dict[str, Errors] | None
-    ) -> tuple[list[Floats], dict[Objective, int]]:
-        """Return the lines of paths that may be the best of any objective, (P, 2) each, and the steps taken as free by objective."""
-        negative = dict[Objective, int]()
-        lines = list(self._iterate_finalists(objectives, errors, negative))
-        different = {np.round(line, 3).tobytes(): line for line in lines}
-        return list(different.values()), negative
+    def find_finalists(self, objective: Objective, errors: Mapping[str, Errors] | None) -> tuple[list[Floats], int]:
+        """Return the lines of paths that may be the best, (P, 2) each, and the free steps of the search for the objective.
 
-    def _iterate_finalists(
-        self, objectives: Sequence[Objective], errors: dict[str, Errors] | None, negative: dict[Objective, int]
-    ) -> Iterator[Floats]:
-        """Yield the shortest path; the best of each objective, for which the model is asked; then others over what is known by then.
-
-        Those are the best of objectives that were not asked for, and with ``errors`` those of little risk.
+        They are the best of each objective, and with ``errors`` those of little risk.
         """
-        bound_m, steps, paths = self._find_shortest()
-        yield from self._draw_lines(steps, paths)
-        asked = [objective for objective in objectives if objective != "distance"]
-        class_id = self.survey.class_id() if asked else None
-        if class_id is None:
-            return
-        for objective in asked:
-            steps, paths = self._find_best(objective, bound_m, class_id)
-            negative[objective] = paths[0].negative_steps
-            yield from self._draw_lines(steps, paths)
-        for objective, quantity in (("energy", "energy"), ("time", "duration")):
-            cautions = (0.0,) if objective not in asked else () if errors is None else _CAUTIONS
-            for caution in cautions:
-                of_all = None if errors is None else errors[quantity]
-                yield from self._draw_lines(*self._find(objective, self.survey.predicted, class_id, of_all, caution))
+        class_id, lines, negative = self.survey.class_id(), list[Floats](), 0
+        for name in OBJECTIVES:
+            steps, paths = self._find(name, class_id)
+            negative = paths[0].negative_steps if name == objective else negative
+            lines += self._draw_lines(steps, paths)
+        if errors is not None and objective != "distance":
+            of_cell = errors["energy" if objective == "energy" else "duration"]
+            for caution in _CAUTIONS:
+                lines += self._draw_lines(*self._find(objective, class_id, of_cell, caution))
+        return list({np.round(line, 3).tobytes(): line for line in lines}.values()), negative
 
-    def _find_shortest(self) -> tuple[float, Steps, tuple[LeastCostPath, ...]]:
-        """Return the length of the shortest path that can be driven, the steps and the path; only the ground is looked at."""
-        straight_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]) * self._metres().max())
-        bound_m = straight_m * _FIRST
-        while True:
-            ellipse = self._ellipse(bound_m)
-            if not self.survey.judged[ellipse].all():
-                logger.info("checking the ground of %d cells", np.count_nonzero(ellipse & ~self.survey.judged))
-            self.survey.judge(ellipse, self.step)
-            self._check_open()
-            steps, paths = self._find("distance", self.survey.judged)
-            if paths and (paths[0].cost <= bound_m or ellipse.all()):
-                return paths[0].cost, steps, paths
-            if ellipse.all():
-                raise PathError(self._no_way())
-            bound_m = max(bound_m * _GROWTH, paths[0].cost if paths else 0.0)
-
-    def _find_best(
-        self, objective: Objective, bound_m: float, class_id: Classes
-    ) -> tuple[Steps, tuple[LeastCostPath, ...]]:
-        """Return the least-cost paths; the model is asked about every cell that could be on the first."""
-        survey, open_ = self.survey, np.asarray(self._maybe_open().any(axis=0))
-        probes, ellipse = probe_cells(class_id, open_), self._ellipse(bound_m) & open_
-        if not survey.predicted[probes | ellipse].all():
-            logger.info(
-                "without --cost-map the model predicts %d to %d cells, %d courses each; "
-                "with a cost map (tcpipe cost-map) a plan takes seconds",
-                *(int(np.count_nonzero(cells & ~survey.predicted)) for cells in (probes | ellipse, open_)),
-                COURSES,
-            )
-        self._ask(probes)
-        self._ask(ellipse)
-        while True:
-            steps, paths = self._find(objective, survey.predicted, class_id)
-            wanted = self._could_be_better(objective, paths[0] if paths else None, class_id)
-            if not wanted.any():
-                if not paths:
-                    raise PathError(self._no_way())
-                return steps, paths
-            self._ask(wanted)
-
-    def _maybe_open(self) -> NDArray[np.bool_]:
-        """Return where a course may be driven as far as is known, shape (16, rows, cols)."""
-        return np.asarray(
-            self.survey.costs.open_courses(allow_extrapolation=self.allow_extrapolation) | ~self.survey.judged
-        )
-
-    def _could_be_better(self, objective: Objective, found: LeastCostPath | None, class_id: Classes) -> Mask:
-        """Return those cells to ask about next that are the likeliest of all that could lie on a better path."""
-        survey, (start, goal) = self.survey, self._cells.tolist()
-        if survey.predicted.all():
-            return ~survey.predicted
-        per_metre = survey.costs.per_metre(objective)
-        steps = make_steps(survey.costs, per_metre, self._maybe_open(), self._metres())
-        over, better = find_possible_gain(steps, class_id, found, start, goal)
-        cells = np.flatnonzero(better & ~survey.predicted.reshape(-1))
-        most = max(_FEWEST_ASKED, int(survey.predicted.sum()) // 2)
-        wanted = np.zeros(survey.predicted.shape, np.bool_)
-        wanted.reshape(-1)[cells[np.argsort(over[cells], kind="stable")[:most]]] = True
-        return wanted
-
-    def _ask(self, wanted: Mask) -> None:
-        """Ask the model about cells, and log how many."""
-        if count := int(np.count_nonzero(wanted & ~self.survey.predicted)):
-            logger.info("predicting %d cells", count)
-            self.survey.predict(wanted, self.step)
-
-    def _draw_lines(self, steps: Steps, paths: Iterable[LeastCostPath]) -> Iterator[Floats]:
+    def _draw_lines(self, steps: Steps, paths: tuple[LeastCostPath, ...]) -> Iterator[Floats]:
         """Yield each path in the map's CRS [m], from end to end as they were given: as its steps, and as straight lines that cost less."""
         grid = self.survey.costs.grid
         for path in paths:
@@ -372,64 +315,11 @@ class _Search:
             yield grid.xy_from_px(points)
             yield grid.xy_from_px(straighten_path(steps, points))
 
-    def _no_way(self) -> str:
-        """Say why there is no way."""
+    def _describe_no_path(self) -> str:
+        """Return why there is no path."""
         text = f"no path from start to goal on map {self.survey.source.name}"
         if not self.allow_extrapolation:
             other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_extrapolation=True, step=self.step)
-            if other._find("distance", self.survey.judged)[1]:
+            if other._find("distance")[1]:
                 return f"{text} within the training range of the model; --allow-extrapolation crosses other ground"
         return f"{text}: the ground between them is not traversable or has no data"
-
-
-_CHEAP = 0.1
-_FEWEST_STEPS = 20
-"""Known steps without which a class is taken to be as cheap as the cheapest other."""
-
-_PROBES = 6
-_CLASSES = 256
-
-
-def probe_cells(class_id: Classes, open_: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return cells to predict first: for each class squares of three by three cells, spread evenly over it.
-
-    ``class_id`` and ``open_`` (whether a cell may be driven over as far as is known) have shape (rows, cols).
-    """
-    rows, cols = class_id.shape
-    found = np.zeros(class_id.shape, np.bool_)
-    for number in np.unique(class_id[open_]).tolist():
-        own = np.flatnonzero((class_id == number) & open_)
-        middle = own[((np.arange(_PROBES) + 0.5) / _PROBES * own.size).astype(np.int64)]
-        for row, col in np.stack(np.divmod(middle, cols), axis=1).tolist():
-            found[max(row - 1, 0) : min(row + 2, rows), max(col - 1, 0) : min(col + 2, cols)] = True
-    return found & open_
-
-
-def find_possible_gain(
-    steps: Steps, class_id: Classes, found: LeastCostPath | None, start: int, goal: int
-) -> tuple[Floats, Mask]:
-    """Return the least that a path over each cell can cost, shape (cells,), and whether that is less than ``found`` costs.
-
-    ``steps`` are all steps that may be possible, with a cost where it is known; ``class_id`` has shape (rows, cols); ``found`` is the best
-    path over known steps; ``start`` and ``goal`` are flat indices of cells.
-    """
-    k = found.potential if found else find_best_potential(steps)
-    bounded = steps._replace(bound_per_m=_find_cheap_by_class(steps, k, class_id)[class_id])
-    limit = found.reduced_cost * (1.0 - 1e-9) if found else np.inf
-    over = compute_least_costs(bounded, k, start, goal, limit=limit)
-    return over, over < limit
-
-
-def _find_cheap_by_class(steps: Steps, k: float, class_id: Classes) -> NDArray[np.float32]:
-    """Return the cheapest tenth of a metre of each class without the grade, shape (256,)."""
-    per_m = np.full((COURSES, *steps.shape), np.nan, np.float32)
-    for course in range(COURSES):
-        compute_steps_within(steps, k, course, class_id, per_m[course])
-    cheap = np.full(_CLASSES, np.nan, np.float32)
-    for number in np.unique(class_id).tolist():
-        own = per_m[:, class_id == number]
-        own = own[np.isfinite(own)]
-        if own.size >= _FEWEST_STEPS:
-            cheap[number] = max(float(np.quantile(own, _CHEAP)), 0.0)
-    known = cheap[np.isfinite(cheap)]
-    return np.where(np.isfinite(cheap), cheap, known.min() if known.size else np.float32(0.0))

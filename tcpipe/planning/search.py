@@ -37,25 +37,23 @@ Ints = NDArray[np.int64]
 Classes = NDArray[np.uint8]
 
 _LEAST = 1e-9
-"""Steps that cost nothing cost this, so that no two states precede each other."""
+"""Least cost of a step, so that no two states precede each other."""
 
 _BINS = 512
 _FLAT = 1e-9
 _STEEPEST_PER_M = 1e5
-"""No robot's weight over its drive's efficiency is above this [N]: ten tonnes."""
+"""Largest weight of a robot over its drive's efficiency [N]: ten tonnes."""
 
 _PRECISION = 1e-3
 
 
 class Steps(NamedTuple):
-    """All steps between neighbouring cells, as what their costs are computed from; kernels take it as it is.
+    """Inputs of the costs of all steps between neighbouring cells, for compiled kernels.
 
     Attributes
     ----------
-    per_metre : cost of a metre in the objective's unit, shape (rows, cols, 16); infinite where a course may not be driven, NaN where it may
-        and no cost is known.
+    per_metre : cost of a metre in the objective's unit, shape (rows, cols, 16); infinite where a course may not be driven.
     height_m : of the cells' middles, shape (rows, cols).
-    bound_per_m : least cost of a metre without the grade, for steps over cells of unknown cost, shape (rows, cols); infinite closes them.
     length_m : of the step along each course, on the ground [m], shape (16,).
     crossed : north and east, in cells, of the cells that a step touches, the last one where it ends, shape (16, 4, 2).
     shares : of the step in each of them, shape (16, 4).
@@ -63,7 +61,6 @@ class Steps(NamedTuple):
 
     per_metre: NDArray[np.float32]
     height_m: Floats
-    bound_per_m: NDArray[np.float32]
     length_m: Floats
     crossed: Ints
     shares: Floats
@@ -83,7 +80,7 @@ class LeastCostPath:
     reduced_cost: float
     potential: float
     negative_steps: int
-    """Steps met by the search that give back more than height explains, taken as free."""
+    """Steps that gain more energy than their height explains; they cost nothing."""
 
 
 def make_steps(costs: CostGrid, per_metre: NDArray[np.float32], open_: NDArray[np.bool_], metres: Floats) -> Steps:
@@ -109,7 +106,6 @@ def make_steps(costs: CostGrid, per_metre: NDArray[np.float32], open_: NDArray[n
     return Steps(
         merged,
         np.nan_to_num(costs.height_m.astype(np.float64), nan=float(np.median(known_m)) if known_m.size else 0.0),
-        np.full(costs.height_m.shape, np.inf, np.float32),
         np.hypot(*MOVES.T) * costs.grid.pixel_size_m * metres,
         crossed,
         shares,
@@ -132,8 +128,6 @@ def compute_step(steps: Steps, k: float, course: int, row: int, col: int) -> flo
         share = steps.shares[course, touch]
         if share > 0.0:
             mean += share * cost
-    if mean != mean:  # not known  # noqa: PLR0124
-        return float(0.5 * (steps.bound_per_m[row, col] + steps.bound_per_m[row1, col1]) * steps.length_m[course])
     return float(mean * steps.length_m[course] - k * (steps.height_m[row1, col1] - steps.height_m[row, col]))
 
 
@@ -162,12 +156,11 @@ def find_best_potential(steps: Steps) -> float:
 
     Metres of about the same grade are taken as their cheapest at either end of the bin, so that a step is never dearer than it is.
     """
-    known = steps._replace(bound_per_m=np.full_like(steps.bound_per_m, np.inf))
-    low, high = _bin_by_grade(known, 0.0, 0.0, np.empty(0))
+    low, high = _bin_by_grade(steps, 0.0, 0.0, np.empty(0))
     if not high - low >= _FLAT:
         return 0.0
     edges, cheapest = np.linspace(low, high, _BINS + 1), np.full(_BINS, np.inf)
-    _bin_by_grade(known, low, high, cheapest)
+    _bin_by_grade(steps, low, high, cheapest)
     used = np.isfinite(cheapest)
     grades, costs = np.concatenate([edges[:-1][used], edges[1:][used]]), np.tile(cheapest[used], 2)
     low, high = -_STEEPEST_PER_M, _STEEPEST_PER_M
@@ -178,28 +171,22 @@ def find_best_potential(steps: Steps) -> float:
 
 
 @compile_kernel
-def _fill_costs(steps: Steps, k: float, cell: int, limit: float, is_back: bool, out: Floats) -> int:  # noqa: FBT001, PLR0917
-    """Write the cost from a cell to each, or back from each to it, to ``out``, (cells,), where it is at most ``limit``; infinite before.
-
-    Return the number of steps met that are taken as free.
-    """
+def _fill_costs(steps: Steps, k: float, goal: int, out: Floats) -> int:
+    """Write the least cost from each cell to the goal to ``out``, (cells,), infinite before; return the number of free steps."""
     rows, cols, courses = steps.per_metre.shape
-    negative, sign = 0, -1 if is_back else 1
-    out[cell] = 0.0
-    heap = [(0.0, cell)]
+    negative = 0
+    out[goal] = 0.0
+    heap = [(0.0, goal)]
     while heap:
         cost, here = heappop(heap)
         if cost > out[here]:
             continue
-        if cost > limit:
-            break
         row, col = here // cols, here % cols
         for course in range(courses):
-            north, east = sign * steps.crossed[course, 3, 0], sign * steps.crossed[course, 3, 1]
-            row1, col1 = row - north, col + east
+            row1, col1 = row + steps.crossed[course, 3, 0], col - steps.crossed[course, 3, 1]
             if row1 < 0 or row1 >= rows or col1 < 0 or col1 >= cols:
                 continue
-            step = compute_step(steps, k, course, row1, col1) if is_back else compute_step(steps, k, course, row, col)
+            step = compute_step(steps, k, course, row1, col1)
             negative += step < 0.0
             there = cost + max(step, _LEAST)
             if there < out[row1 * cols + col1]:
@@ -214,7 +201,7 @@ _ALL = "all"
 
 @dataclass(frozen=True, slots=True)
 class Turning:
-    """Energy of a turn by class id [J/rad], shape (256,), and what a metre of the model's segments turns anyway [rad/m]."""
+    """Energy of a turn by class id [J/rad], shape (256,), and the mean turn of the training segments [rad/m]."""
 
     joule_per_rad: Floats
     usual_radpm: float
@@ -222,16 +209,16 @@ class Turning:
     def energy_joule(
         self, turn_rad: Floats, length_m: Floats, class_id: NDArray[np.uint8], *, is_driven: bool = False
     ) -> Floats:
-        """Return what turns cost beyond the usual [J], shape (N,), of N path segments of these lengths on these classes.
+        """Return the cost of turns beyond the usual [J], shape (N,), of N path segments of these lengths on these classes.
 
-        A driven one may turn less than usual and cost less; a drawn one turns no less: nobody drives as straight as a line.
+        A driven segment may turn less than usual and cost less; a drawn one counts as usual, since no robot drives as straight as a line.
         """
         beyond_rad = np.abs(turn_rad) - self.usual_radpm * length_m
         return np.asarray(self.joule_per_rad[class_id] * (beyond_rad if is_driven else np.maximum(beyond_rad, 0.0)))
 
 
 def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
-    """Return what turning costs by a fit, None without such a term; a class without a term costs the mean of the others."""
+    """Return the cost of turning by a fit, None without such a term; a class without a term has the mean of the others."""
     found = {} if fit is None else {term.terrain: term.value for term in fit.terms if term.term == "turning"}
     if fit is None or not found:
         return None
@@ -255,7 +242,7 @@ _TURNS_RAD = np.radians(np.diff(np.append(ANGLES_DEG, 360.0)))
 """From each course to the next [rad], shape (16,)."""
 
 _STEP, _LEFT, _RIGHT, _START = 1, 2, 3, 4
-"""How a state of the search with turns is reached; 0: not yet."""
+"""Ways by which the search reaches a state; 0: not reached."""
 
 
 @compile_kernel
@@ -301,13 +288,13 @@ def _find_turning(  # noqa: PLR0917
 def find_least_cost_paths(  # noqa: PLR0917
     steps: Steps, k: float, start: int, goal: int, turning: Turning | None = None, class_id: Classes | None = None
 ) -> tuple[LeastCostPath, ...]:
-    """Return the least-cost path from a cell to another (flat indices); nothing where there is none.
+    """Return the least-cost path from a cell to another (flat indices); an empty tuple without one.
 
-    ``k`` is the potential. With what turns cost, and the class of each cell, shape (rows, cols), the path of least energy with turns
-    comes first.
+    ``k`` is the potential. With the cost of turns, and the class of each cell, shape (rows, cols), the path of least energy with turns
+    is the first.
     """
     to_goal = np.full(steps.height_m.size, np.inf)
-    negative = _fill_costs(steps, k, goal, np.inf, True, to_goal)
+    negative = _fill_costs(steps, k, goal, to_goal)
     if not np.isfinite(to_goal[start]):
         return ()
     of_turns = [np.zeros(_CLASSES)] if turning is None else [turning.joule_per_rad, np.zeros(_CLASSES)]
@@ -336,27 +323,6 @@ def _trace_back(state: int, arrived: NDArray[np.int8], steps: Steps, k: float) -
         else:
             state = cell * COURSES + (course + (-1 if way == _LEFT else 1)) % COURSES
     return np.array(cells[::-1]), raw, reduced
-
-
-def compute_least_costs(steps: Steps, k: float, start: int, goal: int, *, limit: float) -> Floats:
-    """Return what the cheapest path over each cell costs without the grade, shape (cells,); infinite where that is more than ``limit``."""
-    there, back = np.full((2, steps.height_m.size), np.inf)
-    _fill_costs(steps, k, start, limit, False, there)
-    _fill_costs(steps, k, goal, limit, True, back)
-    return np.asarray(there + back)
-
-
-@compile_kernel
-def compute_steps_within(steps: Steps, k: float, course: int, class_id: Classes, out: NDArray[np.float32]) -> None:
-    """Write the cost of a metre without the grade of each known step along a course that stays in one class; both (rows, cols)."""
-    rows, cols = out.shape
-    for row in range(rows):
-        for col in range(cols):
-            cost = compute_step(steps, k, course, row, col)
-            if cost < np.inf:
-                north, east = steps.crossed[course, 3]
-                if class_id[row, col] == class_id[row - north, col + east]:
-                    out[row, col] = cost / steps.length_m[course]
 
 
 SAMPLES_A_CELL = 4

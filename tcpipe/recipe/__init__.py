@@ -330,8 +330,6 @@ class TrainConfig(_Section):
     """ResNet-18."""
     width: Annotated[int, Bounds(ge=16, le=512)] = 64
     """ResNet-18: filters of the first stage, a multiple of 16."""
-    cross_fit: bool = False
-    """ResNet-18: train a network without each other fold, too, so that intervals rest on all samples (five times as long)."""
     mirror: bool = True
     """ResNet-18: mirror every other patch."""
     trees: Annotated[int, Bounds(ge=1, le=10_000)] = 150

@@ -53,19 +53,13 @@ MESSAGE_DEFINITIONS = Option(
 )  # fmt: skip
 MAP = Option("Map to look at (default: the only one in the store).", ("--map",), "map", "NAME")
 MODEL = Option(kind="sealed", metavar="MODEL", is_argument=True)
-PHYSICS = Option(
-    "Dataset whose card has the power of turning of the robot (default: the one that MODEL was trained on).",
-    ("--physics-from",),
-    "sealed",
-    "DATASET",
-)
 SPEED = Option(
     "Commanded speed, for a model trained with --extra-features (default: the mean of its training).",
     ("--speed",),
     Range(0.0, 100.0, is_open=True),
     "MPS",
 )
-PREDICTOR = Option("Run your own model: FILE.py[:NAME] or entry point.", metavar="CODE")
+PREDICTOR = Option("Run your own model: FILE.py[:NAME].", metavar="CODE")
 DRY_RUN = Option("Print what would be done; change nothing.")
 SEED = Range(0, 2**32 - 1)
 """Seeds of all random number generators."""

@@ -50,12 +50,12 @@ def test_every_option_of_train_is_in_the_card_of_the_model(place: Path) -> None:
             "2",
         ),
         *("--batch-size", "32", "--learning-rate", "0.001", "--fold", "1", "--width", "16", "--seed", "5"),
-        *("--no-mirror", "--inverse-variance-weights", "--no-resume", "--quiet"),
+        *("--no-mirror", "--no-resume", "--quiet"),
     )
     assert answer("train", "dataset", "model", *options, cwd=place)["status"] == "done"
     wanted = FitConfig(
         loss="paper_eq4", label="net", epochs=1, patience=2, batch_size=32, learning_rate=0.001, fold=1, width=16, seed=5,
-        mirror=False, inverse_variance_weights=True,
+        mirror=False,
     )  # fmt: skip
     assert load_model(place / "model").card.training.config == wanted
 

@@ -72,11 +72,10 @@ def test_the_benchmark_has_every_kind_and_resumes(reproduced):
     assert same["rmse"] == whole["rmse"]
 
 
-def test_every_page_says_that_the_data_are_simulated(reproduced):
+def test_the_page_says_that_the_data_are_simulated(reproduced):
     here, _ = reproduced
-    for page in ("reproduction.html", "dataset/resnet18-0/evaluation/evaluation.html"):
-        assert "The data are simulated" in (here / "here" / page).read_text()
     page = (here / "here" / "reproduction.html").read_text()
+    assert "The data are simulated" in page
     assert "the small site" in page
 
 
@@ -86,8 +85,6 @@ def test_even_a_quick_network_learns_that_slope_costs_time(reproduced):
     for split in ("test", "unseen"):
         ours, expected = (values["time"][who][split]["mape_percent"] for who in ("ours", "expected time"))
         assert ours < expected
-        floor = values["splits"][split]["simulation_floor"]["E"]["all"]
-        assert floor["mape_percent"] < values["splits"][split]["errors"]["E"]["all"]["mape_percent"]
 
 
 def test_again_is_nothing_to_do(reproduced):
@@ -117,11 +114,8 @@ def test_train_and_evaluate_by_hand(reproduced):
     here, _ = reproduced
     trained = tcpipe("train", "here/dataset", "model", "--width", "16", "--epochs", "1", cwd=here, env=ENV)
     assert trained.returncode == 0, trained.stderr
-    assert "% of it feeding" in trained.stdout
     done = tcpipe("evaluate", "model", "here/dataset", "--noise-draws", "1", "--json", cwd=here, env=ENV)
     assert set(json.loads(done.stdout)["splits"]) == {"test", "unseen"}
-    page = (here / "evaluation" / "evaluation.html").read_text()
-    assert "The data are simulated" not in page  # a dataset does not say so of itself
 
 
 def test_an_interrupted_training_ends_as_one_that_is_not(reproduced, tmp_path):

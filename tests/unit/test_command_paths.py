@@ -124,7 +124,7 @@ CALLS = [
     "report empty",
     "report file",
     "reproduce other",
-    "route-graph gone --store empty",
+    "route-graph gone --store empty --graph gone.geojson",
     "route-graph empty --store empty --graph gone.geojson",
     "simulate other",
     "status --store gone",

@@ -1,9 +1,9 @@
-"""Maps that Nav2's map_server loads: a grey picture (.pgm) and what it means (.yaml), mode ``scale``.
+"""Files of Nav2: maps and filter masks of map_server, parameters, path messages, GPS waypoints, and graphs of the route server.
 
-In that mode grey falls from white (cost 0) in even steps to almost black (98). Black alone is above ``occupied_thresh``: lethal to every
-reader, also to those that end the scale at 99. A .pgm has no alpha, so unknown would look like lethal: what is not known is lethal.
-
-The style (QML) in which QGIS shows a band of a cost map.
+A map is a grey picture (.pgm) and its description (.yaml). In mode ``scale`` grey falls from white (cost 0) in even steps to almost black
+(98). Black alone is above ``occupied_thresh``: lethal to every reader, also to those that end the scale at 99. A .pgm has no alpha, so
+that unknown cells are lethal. In mode ``raw`` a pixel is the value itself. Messages are JSON, which is YAML too: ``ros2`` commands read
+both.
 """
 
 from __future__ import annotations
@@ -38,18 +38,26 @@ def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, frame:
     """Write ``path`` (.yaml) and the picture of the same name beside it.
 
     ``cost`` is from 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first; ``grid`` places the cells in the frame; ``frame`` and
-    ``meaning`` are lines that say what x and y, and what a cost is.
+    ``meaning`` are comments: the axes x and y, and the meaning of a cost.
     """
     grey = np.where(cost == LETHAL, 0.0, np.rint(255.0 * (1.0 - _OCCUPIED * cost / 100.0))).astype(np.uint8)
+    _write_grey(path, grey, grid, mode="scale", comments=(meaning, f"frame: {frame}"))
+
+
+def write_nav2_mask(path: Path, values: NDArray[np.uint8], grid: MapGrid, *, frame: str, meaning: str) -> None:
+    """Write the mask of a costmap filter as `write_nav2_map`, in mode ``raw``: a pixel is the mask's value, 0 to 100."""
+    _write_grey(path, values, grid, mode="raw", comments=(meaning, f"frame: {frame}"))
+
+
+def _write_grey(path: Path, grey: NDArray[np.uint8], grid: MapGrid, *, mode: str, comments: Sequence[str]) -> None:
     picture = path.with_suffix(".pgm")
     with write_atomic_file(picture) as temporary:
         temporary.write_bytes(f"P5\n{grid.cols} {grid.rows}\n255\n".encode() + grey.tobytes())
     x_min, y_min, _, _ = grid.bounds_m
     lines = (
-        f"# {meaning}",
-        f"# frame: {frame}",
+        *(f"# {comment}" for comment in comments),
         f"image: {picture.name}",
-        "mode: scale",
+        f"mode: {mode}",
         f"resolution: {grid.pixel_size_m!r}",
         f"origin: [{x_min!r}, {y_min!r}, 0.0]",
         "negate: 0",
@@ -60,22 +68,79 @@ def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, frame:
     write_text(path, "\n".join(lines))
 
 
-_COLOURS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")
-"""Viridis: from the least to the greatest; its colours differ for any colour vision, and in grey."""
-_HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n<qgis version=\"3.22.0\">\n"
+_PARAMETERS = """\
+# Parameters of Nav2 for the maps in this folder; merge them into your own and give the paths of the .yaml files.
+map_server: {{ros__parameters: {{yaml_filename: energy.yaml}}}}
+global_costmap:
+  global_costmap:
+    ros__parameters:
+      static_layer: {{plugin: nav2_costmap_2d::StaticLayer, trinary_costmap: false}}
+      filters: [keepout_filter, speed_filter]
+      keepout_filter: {{plugin: nav2_costmap_2d::KeepoutFilter, filter_info_topic: keepout_info}}
+      speed_filter: {{plugin: nav2_costmap_2d::SpeedFilter, filter_info_topic: speed_info, speed_limit_topic: speed_limit}}
+planner_server:
+  ros__parameters:
+    planner_plugins: [GridBased]
+    # cost of a metre: 1 + multiplier * cost / 252, in proportion to {quantity} from {lowest:.6g} to {highest:.6g} {unit}
+    GridBased: {{plugin: nav2_smac_planner::SmacPlanner2D, cost_travel_multiplier: {multiplier:.4f}}}
+keepout_mask_server: {{ros__parameters: {{yaml_filename: keepout.yaml, topic_name: keepout_mask}}}}
+keepout_info_server:
+  ros__parameters: {{type: 0, filter_info_topic: keepout_info, mask_topic: keepout_mask, base: 0.0, multiplier: 1.0}}
+speed_mask_server: {{ros__parameters: {{yaml_filename: speed.yaml, topic_name: speed_mask}}}}
+speed_info_server:  # type 2: a limit in m/s
+  ros__parameters: {{type: 2, filter_info_topic: speed_info, mask_topic: speed_mask, base: 0.0, multiplier: {speed:.9f}}}
+"""
 
 
-def make_raster_style(band: int, low: float, high: float) -> str:
-    """Return the style of a raster whose band, counted from 1, is coloured from the least value to the greatest."""
-    step = (high - low) / (len(_COLOURS) - 1)
-    stops = [(low + at * step, colour) for at, colour in enumerate(_COLOURS)]
-    items = "".join(f'<item alpha="255" color="{colour}" value="{at!r}" label="{at:.4g}"/>' for at, colour in stops)
-    shader = f'colorRampType="INTERPOLATED" classificationMode="1" minimumValue="{low!r}" maximumValue="{high!r}"'
-    bounds = f'classificationMin="{low!r}" classificationMax="{high!r}"'
-    return (
-        f'{_HEAD}<pipe><rasterrenderer type="singlebandpseudocolor" band="{band}" opacity="1" {bounds}>'
-        f"<rastershader><colorrampshader {shader}>{items}</colorrampshader></rastershader></rasterrenderer></pipe>\n</qgis>\n"
+def format_nav2_parameters(*, quantity: str, unit: str, lowest: float, highest: float, speed_step_mps: float) -> str:
+    """Return parameters of Nav2's servers for a map of a cost a metre, its masks and a planner to which the cost is in proportion.
+
+    Parameters
+    ----------
+    quantity, unit, lowest, highest : what a cost is, and the values of the costs 0 and `HIGHEST`.
+    speed_step_mps : speed of one step of the speed mask [m/s].
+    """
+    multiplier = max(highest / lowest - 1.0, 0.0) if lowest > 0.0 else 0.0
+    return _PARAMETERS.format(
+        quantity=quantity, unit=unit, lowest=lowest, highest=highest, multiplier=multiplier, speed=speed_step_mps
     )
+
+
+_POSE_M = 0.25
+"""Largest distance of neighbouring poses of a path message [m]: controllers expect dense paths."""
+
+
+def make_path_message(xy_m: NDArray[np.float64]) -> Json:
+    """Return a ``nav_msgs/Path`` along points in the frame ``map`` [m], shape (P, 2), with the course of travel as yaw."""
+    away_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))]
+    between_m = np.linspace(0.0, away_m[-1], int(np.ceil(away_m[-1] / _POSE_M)) + 1)
+    along_m = np.unique(np.r_[away_m, between_m])
+    points = np.column_stack([np.interp(along_m, away_m, column) for column in xy_m.T])
+    header: Json = {"frame_id": "map"}
+    poses = [
+        {"header": header, "pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": orientation}}
+        for (x, y), orientation in zip(points.tolist(), _make_orientations(points), strict=True)
+    ]
+    return {"header": header, "poses": poses}
+
+
+def make_gps_waypoints(lonlat_deg: NDArray[np.float64], enu_m: NDArray[np.float64]) -> Json:
+    """Return the goal of ``nav2_msgs/action/FollowGPSWaypoints``: the points of a path after its start, shape (P, 2).
+
+    ``enu_m`` are the same points in a true east-north frame [m]; a waypoint has the yaw with which the path arrives there.
+    """
+    poses = [
+        {"position": {"latitude": lat, "longitude": lon, "altitude": 0.0}, "orientation": orientation}
+        for (lon, lat), orientation in zip(lonlat_deg[1:].tolist(), _make_orientations(enu_m), strict=False)
+    ]
+    return {"number_of_loops": 0, "goal_index": 0, "gps_poses": poses}
+
+
+def _make_orientations(xy_m: NDArray[np.float64]) -> list[Json]:
+    """Return the course from each point to the next as quaternions; the last point has that of the one before."""
+    east, north = np.diff(xy_m, axis=0).T
+    half = np.arctan2(north, east) / 2.0
+    return [{"x": 0.0, "y": 0.0, "z": float(np.sin(a)), "w": float(np.cos(a))} for a in (*half, half[-1])]
 
 
 _EDGES = ("LineString", "MultiLineString")
@@ -121,18 +186,6 @@ def _make_edge(edge_id: int, start: int, end: int, nodes: Mapping[int, tuple[flo
     geometry: Json = {"type": "LineString", "coordinates": [nodes[start], nodes[end]]}
     properties: Json = {"id": edge_id, "startid": start, "endid": end}
     return RouteEdge(edge_id, start, end, {"type": "Feature", "properties": properties, "geometry": geometry})
-
-
-def make_route_graph(xy_m: NDArray[np.float64], pairs: Sequence[tuple[int, int]]) -> RouteGraph:
-    """Return a graph of nodes at these places, shape (N, 2), and of an edge in both directions for each pair of them."""
-    nodes = {number: (round(x, 3), round(y, 3)) for number, (x, y) in enumerate(xy_m.tolist())}
-    points: list[Json] = [
-        {"type": "Feature", "properties": {"id": node}, "geometry": {"type": "Point", "coordinates": place}}
-        for node, place in nodes.items()
-    ]
-    ways = [way for a, b in pairs for way in ((a, b), (b, a))]
-    edges = tuple(_make_edge(len(nodes) + number, a, b, nodes) for number, (a, b) in enumerate(ways))
-    return RouteGraph({"type": "FeatureCollection", "name": "tcpipe"}, points, nodes, edges)
 
 
 def read_route_graph(path: Path) -> RouteGraph:

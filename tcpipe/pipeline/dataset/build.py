@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tcpipe.errors import DatasetError, StoreError, TcpipeError, UsageError, clean_lines, list_first
 from tcpipe.execution import refuse_import_of_script
-from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory
+from tcpipe.formats.atomic import check_local_output, clear_beside
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -26,7 +26,7 @@ from tcpipe.formats.finding_lines import format_budget, format_groups, list_verd
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import return_freed_memory
-from tcpipe.formats.published_outputs import check_kind, fetch_directory_by_range, find_newest, write_output
+from tcpipe.formats.published_outputs import check_kind, fetch_directory_by_range, find_newest, publish_directory
 from tcpipe.formats.runs import Options, Output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import BUILD, RunningCall, describe_error, record_call
@@ -188,9 +188,8 @@ def _build(
     prove_maps(call.store, job.inputs.map_records)
     from tcpipe.pipeline.dataset.writing import write_dataset  # noqa: PLC0415  slow to import, and often nothing is to be built
 
-    output = write_output(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
     return_freed_memory()
-    with output as directory:
+    with publish_directory(place, CARD) as directory:
         card = write_dataset(directory, job.inputs, job.marks, options.jobs)
         _refuse_others_since(place, {job.known.inputs if job.known else None, job.inputs.digest})
         foreign = _find_foreign_files(place, job.known)

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from adapted_drives import compare_adaptations
 
-from tcpipe.cost.adaptation import Metres, Run, adapt, compare_adaptations
+from tcpipe.cost.adaptation import Metres, Run, adapt
 from tcpipe.cost.prediction_errors import fit_errors
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from made_models import made_comparison
 
+from tcpipe.experiment.claims import CLAIMS, FEWEST_SEEDS, check_claims
 from tcpipe.experiment.networks import HEIGHTS
-from tcpipe.experiment.simulation_floor import CLAIMS, FEWEST_SEEDS, check_claims
 from tcpipe.learning.metrics import Ratio
 
 SURE = Ratio(0.8, 0.7, 0.9)

@@ -36,7 +36,7 @@ def test_one_line_in_any_wrapping_is_read(tmp_path, document):
     ("document", "words"),
     [
         ("{", "not JSON"),
-        ({"type": "FeatureCollection", "features": []}, "is empty"),
+        ({"type": "FeatureCollection", "features": []}, "has 0 features"),
         ({"type": "LineString", "coordinates": []}, "is empty"),
         ({"type": "LineString", "coordinates": [[15.0, 47.0]]}, "must contain 0 or >1"),
         ({"type": "LineString", "coordinates": [[15.0, 47.0], [15.0, 47.0]]}, "one point"),
@@ -46,7 +46,7 @@ def test_one_line_in_any_wrapping_is_read(tmp_path, document):
         ({"type": "LineString", "coordinates": [[500000.0, 5200000.0], [500010.0, 5200000.0]]}, "projected"),
         ({"type": "Point", "coordinates": [15.0, 47.0]}, "expected one LineString"),
         ({"type": "MultiLineString", "coordinates": [LINE["coordinates"]] * 2}, "expected one LineString"),
-        ({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": LINE}] * 2}, "has 2 lines"),
+        ({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": LINE}] * 2}, "has 2 features"),
     ],
 )
 def test_what_is_no_path_is_one_line_of_error(tmp_path, document, words):

@@ -1,7 +1,6 @@
 """The user's own models, those of docs/examples: they can do all that shipped ones can, and run only where they are named."""
 
 import json
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from synthetic_store import box, lonlat, region_file, small_store
 import tcpipe
 from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import ModelError, UsageError
-from tcpipe.learning import own_models
 from tcpipe.learning.models import load_model
 from tcpipe.pipeline.verify import verify
 
@@ -61,7 +59,7 @@ def test_an_example_is_trained_evaluated_and_planned_with(place, monkeypatch, tm
     start, goal = lonlat([(-12.0, -5.0), (-2.0, -4.0)]).tolist()
     rules = {"store": store, "out": tmp_path / "plan.geojson", "allow_extrapolation": True}
     plan = tcpipe.plan_path(model, start, goal, **rules, **own)
-    assert plan.plans["energy"].length_m >= 10.0
+    assert plan.length_m >= 10.0
 
 
 def test_the_command_takes_it_and_a_folder_alone_runs_nothing(place, tmp_path):
@@ -161,15 +159,6 @@ def test_code_that_cannot_be_used_is_one_line(place, tmp_path, text, error, matc
         tcpipe.train(place[0] / "dataset", tmp_path / "model", predictor=str(tmp_path / "mine.py"))
     assert len(told.value.problems) == 1
     assert not (tmp_path / "model").exists()
-
-
-def test_entry_points_are_found_by_name(place, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(place[0])
-    point = EntryPoint("hand", "by_hand:predict", own_models.GROUP)
-    monkeypatch.setattr(own_models, "entry_points", lambda group: [point] if group == own_models.GROUP else [])
-    assert tcpipe.train(place[0] / "dataset", tmp_path / "model", predictor="hand").status == "done"
-    with pytest.raises(UsageError, match=r"other: no such entry point of group tcpipe\.predictors \(there are: hand\)"):
-        load_model(tmp_path / "model", "other")
 
 
 def test_a_shipped_kind_needs_no_code(place, tmp_path):

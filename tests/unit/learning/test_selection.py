@@ -83,7 +83,7 @@ def test_curves_are_models_like_the_others(dataset, tmp_path):
     train(dataset, tmp_path / "model", config=FitConfig(model="linear"))
     model, data = load_model(tmp_path / "model"), open_dataset(dataset)
     split, features = data["train"], read_extra_features(data["train"])
-    curves = fit_curves("linear", features.slope_rad, features.class_id, split.labels.astype(np.float64))
+    curves = fit_curves(features.slope_rad, features.class_id, split.labels.astype(np.float64))
     there = read_extra_features(data["unseen"])
     said = model.predict(data["unseen"].with_channels("height").patches, there).mean
     assert said == pytest.approx(curves.predict(there.slope_rad, there.class_id), rel=1e-6)

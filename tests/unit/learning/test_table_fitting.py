@@ -11,7 +11,7 @@ from installed_command import tcpipe
 
 from tcpipe.dataset import open_dataset
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.models import HISTORY, README, WEIGHTS, load_model
+from tcpipe.learning.models import HISTORY, WEIGHTS, load_model
 from tcpipe.learning.training import train
 from tcpipe.pipeline.verify import verify
 from tcpipe.planning.cost_model import predict_patches
@@ -38,7 +38,6 @@ def test_it_predicts_what_it_was_made_of(trained, dataset):
     assert model.predict(split.patches[3:4]).mean == pytest.approx(said[3:4])
     assert sum(model.card.training_range.class_counts.values()) == len(split)
     assert verify(place).problems == ()
-    assert "Kind boosting: a curve over the slope" in (place / README).read_text()
 
 
 def test_every_sample_was_held_out_once(trained, dataset):
@@ -57,10 +56,9 @@ def test_the_same_again_is_nothing_to_do_and_the_same_bytes(trained, dataset, tm
         assert (tmp_path / "model" / name).read_bytes() == (trained[0] / name).read_bytes()
 
 
-def test_one_layer_and_weights(dataset, tmp_path):
+def test_one_layer(dataset, tmp_path):
     train(dataset, tmp_path / "height", config=replace(CONFIG, layers=("height",)))
     assert load_model(tmp_path / "height").card.inputs.channels == ("height",)
-    train(dataset, tmp_path / "weighed", config=replace(CONFIG, inverse_variance_weights=True))
 
 
 def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):

@@ -9,10 +9,8 @@ from tcpipe.errors import ModelError
 from tcpipe.learning import table_model as forest
 from tcpipe.learning.predictor import Inputs
 from tcpipe.learning.table_model import (
-    MOST_COMPONENTS,
     BoostingModel,
     compute_patch_features,
-    fit_components,
     fit_table,
 )
 from tcpipe.recipe import TrainConfig
@@ -71,7 +69,7 @@ def _drawn(count, seed=0):
 
 def _make_trees(count=600):
     features, labels, folds = _drawn(count)
-    return features, labels, folds, *forest.grow(features, labels, np.ones_like(labels), folds)
+    return features, labels, folds, *forest.grow(features, labels, folds)
 
 
 def test_they_predict_as_lightgbm_and_are_its_own_text():
@@ -84,7 +82,7 @@ def test_they_predict_as_lightgbm_and_are_its_own_text():
         assert booster.num_trees() <= largest
         assert forest.clean_trees(text, 4) == text, number
     assert np.std(held_out - labels, axis=0) == pytest.approx([5.0, 0.02], rel=0.25)
-    assert forest.grow(features, labels, np.ones_like(labels), folds)[0] == trees
+    assert forest.grow(features, labels, folds)[0] == trees
 
 
 @pytest.mark.parametrize(
@@ -118,7 +116,7 @@ def test_a_text_by_which_the_reader_would_leave_its_memory_is_refused(name, valu
 def test_without_lightgbm_there_is_one_line(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "lightgbm", None)
     with pytest.raises(ModelError, match=r"lightgbm not installed, .* pip install 'tcpipe\[tables\]'"):
-        forest.grow(*_drawn(9)[:2], np.ones((9, 2)), np.arange(9) % 3)
+        forest.grow(*_drawn(9)[:2], np.arange(9) % 3)
 
 
 pytest.importorskip("lightgbm")
@@ -140,7 +138,7 @@ def ground(count=900, steepest=0.2, seed=0):
 @pytest.fixture(scope="module")
 def fitted():
     features, labels, folds = ground()
-    return fit_table(features, labels, np.ones_like(labels), folds, channels=CHANNELS, class_count=CLASSES)
+    return fit_table(features, labels, folds, channels=CHANNELS, class_count=CLASSES)
 
 
 def test_steeper_ground_than_any_goes_on_straight_and_texture_is_heeded(fitted):
@@ -167,26 +165,10 @@ def test_what_the_other_folds_said_is_no_better_than_what_is_new(fitted):
 def test_arrays_there_and_back_and_another_model():
     features, labels, folds = ground()
     features = features[:, : 3 + CLASSES + 6]
-    model, *_ = fit_table(features, labels, np.ones_like(labels), folds, channels=CHANNELS, class_count=CLASSES)
+    model, *_ = fit_table(features, labels, folds, channels=CHANNELS, class_count=CLASSES)
     inputs = Inputs(CHANNELS, 40, CHANNELS, 1.0, CLASSES, (), ("power_watt", "velocity_mps"), (1.0, 1.0))
     again = BoostingModel.from_arrays(model.arrays(), inputs).table
     assert np.array_equal(again.predict(features), model.predict(features))
     trees = {name: array for name, array in model.arrays().items() if name.startswith("trees")}
     with pytest.raises(ModelError, match=r"the weights of another model: curve_.* is missing; train the model again"):
         BoostingModel.from_arrays(trees, inputs)
-
-
-def test_components_of_bands_are_those_of_their_covariance():
-    channels = ("height", *(f"e[{n}]" for n in range(1, 13)), "ortho", *(f"two[{n}]" for n in (1, 2)))
-    rng = np.random.default_rng(5)
-    features = rng.normal(size=(300, 6 + 12 * 2 + 3 + 2 * 2))
-    means = 6 + 2 * np.arange(12)
-    features[:, means] = features[:, means] @ rng.normal(size=(12, 12)) + 3.0
-    found = fit_components(features, channels, CLASSES).append(features)[:, features.shape[1] :]
-    assert found.shape == (300, MOST_COMPONENTS + 2)
-    values, vectors = np.linalg.eigh(np.cov(features[:, means].T))
-    wanted = (features[:, means] - features[:, means].mean(axis=0)) @ vectors[:, ::-1][:, :MOST_COMPONENTS]
-    np.testing.assert_allclose(np.abs(found[:, :MOST_COMPONENTS]), np.abs(wanted), atol=1e-9)
-    np.testing.assert_allclose(found[:, :MOST_COMPONENTS].var(axis=0, ddof=1), values[::-1][:MOST_COMPONENTS])
-    np.testing.assert_allclose(np.corrcoef(found[:, MOST_COMPONENTS:].T)[0, 1], 0.0, atol=1e-12)
-    assert fit_components(features[:, :9], ("height", "ortho"), CLASSES).append(features[:, :9]).shape == (300, 9)

@@ -4,7 +4,6 @@ import json
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from xml.etree.ElementTree import fromstring
 
 import matplotlib.image
 import numpy as np
@@ -205,15 +204,42 @@ def test_nav2_maps_of_an_origin_are_true_east_and_north(tmp_path):
         assert cost[row, col - 12] < 99
 
 
-def test_qgis_shows_the_mean_from_the_least_to_the_greatest(made):
+def test_masks_and_parameters_are_those_of_nav2_s_costmap_filters(made):
+    """Read as map_server in mode raw, by CostmapFilterInfo (value = base + multiplier * mask), and as Smac 2D weighs costs."""
     _, result = made
-    text = (Path(result.path) / "energy.qml").read_text()
-    renderer = fromstring(text[text.index("<qgis") :]).find("pipe/rasterrenderer")  # noqa: S314
-    band, scale = int(renderer.get("band")), result.card.nav2_scale["energy"]
-    with rasterio.open(Path(result.path) / "energy.tif") as dataset:
-        assert dataset.descriptions[band - 1] == "mean"
-    values = [float(item.get("value")) for item in renderer.iter("item")]
-    assert values == pytest.approx(np.linspace(scale.lowest, scale.highest, 5))
+    here, parameters = Path(result.path), YAML(typ="safe").load((Path(result.path) / "nav2.yaml").read_text())
+    costs = open_cost_map(here, read_cost_map_card(here))
+    is_free = (costs.reasons == 0).any(axis=0)
+    masks = {}
+    for name, kind in (("keepout", 0), ("speed", 2)):
+        about = YAML(typ="safe").load((here / f"{name}.yaml").read_text())
+        assert (about["mode"], about["origin"][:2]) == ("raw", [500_000.0, 5_200_000.0 - 24.0])
+        mask = matplotlib.image.imread(here / about["image"]).astype(int)
+        info = parameters[f"{name}_info_server"]["ros__parameters"]
+        server = parameters[f"{name}_mask_server"]["ros__parameters"]
+        layer = parameters["global_costmap"]["global_costmap"]["ros__parameters"][f"{name}_filter"]
+        assert info["type"] == kind
+        assert info["mask_topic"] == server["topic_name"]
+        assert info["filter_info_topic"] == layer["filter_info_topic"]
+        assert server["yaml_filename"] == f"{name}.yaml"
+        assert ((mask >= 0) & (mask <= 100)).all()
+        masks[name] = info["base"] + info["multiplier"] * mask
+    assert (masks["keepout"] == np.where(is_free, 0, 100)).all()
+    with rasterio.open(here / "velocity.tif") as dataset:
+        mean_mps = dataset.read(18)
+    step_mps = parameters["speed_info_server"]["ros__parameters"]["multiplier"]
+    limit = masks["speed"][is_free]
+    assert ((limit > mean_mps[is_free] - step_mps - 1e-6) & (limit <= mean_mps[is_free] + 1e-6)).all()
+    assert (masks["speed"][~is_free] == 0.0).all()
+    multiplier = parameters["planner_server"]["ros__parameters"]["GridBased"]["cost_travel_multiplier"]
+    cost, _ = read_as_map_server(here / "energy.yaml")
+    _, layer = read_as_static_layers(cost)
+    with rasterio.open(here / "energy.tif") as dataset:
+        mean_jpm = dataset.read(18)
+    weight = (1.0 + multiplier * layer / 252.0)[is_free]
+    scale = result.card.nav2_scale["energy"]
+    wanted = np.clip(mean_jpm[is_free], scale.lowest, scale.highest) / scale.lowest
+    np.testing.assert_allclose(weight, wanted, rtol=0.02)
 
 
 @dataclass(frozen=True)

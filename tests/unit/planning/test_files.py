@@ -1,11 +1,13 @@
-"""What predict-path and plan-path write: once, whole, and again only when something changed."""
+"""The files that predict-path and plan-path write, and files that they do not replace."""
 
 import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pyarrow.csv
+import pyproj
 import pytest
 from map_worlds import ArrayMap
 from physics_model import PhysicsModel
@@ -41,7 +43,6 @@ def _write_path(path: Path, points) -> None:
 def test_the_table_is_the_same_in_every_format(source, path, ending):
     out = path.with_name(f"path-segments.{ending}")
     found = predict_path(MODEL, source, path, out)
-    assert found.status == "done"
     assert found.exit_code == 0
     rows = {
         "csv": lambda: pyarrow.csv.read_csv(out).to_pylist(),
@@ -54,33 +55,6 @@ def test_the_table_is_the_same_in_every_format(source, path, ending):
     if ending == "geojson":  # the lines join up
         lines = [feature["geometry"]["coordinates"] for feature in json.loads(out.read_text())["features"]]
         assert all(one[1] == other[0] for one, other in pairwise(lines))
-
-
-def test_a_second_call_does_nothing_until_something_changes(source, path):
-    out = path.with_name("path-segments.csv")
-    first = predict_path(MODEL, source, path, out)
-    second = predict_path(MODEL, source, path, out)
-    assert second.status == "unchanged"
-    assert "nothing to do" in str(second)
-    assert second.energy_joule == first.energy_joule
-    out.write_text(out.read_text()[:-30])
-    assert predict_path(MODEL, source, path, out).status == "done"
-    assert predict_path(replace(MODEL, checksum="1" * 64), source, path, out).status == "done"
-
-
-def test_a_way_there_and_back_is_one_path(source, tmp_path):
-    request = _request(source, objective="distance", cell_size_m=2.0, out=tmp_path / "plan.geojson", round_trip=True)
-    found = plan(MODEL, source, request)
-    both = predict_path(MODEL, source, tmp_path / "plan.geojson", None)
-    ways = found.plans["distance"].length_m, found.together.back.length_m
-    assert both.length_m == pytest.approx(sum(ways), rel=1e-3)
-    assert both.energy_joule == pytest.approx(found.together.energy_joule, rel=0.02)
-    _write_path(tmp_path / "one.geojson", lonlat(source, (3.0, 12.0), (20.0, 14.0)))
-    apart = json.loads((tmp_path / "one.geojson").read_text())
-    apart["features"] *= 2
-    (tmp_path / "apart.geojson").write_text(json.dumps(apart))
-    with pytest.raises(PathError, match="of which one does not begin where another ends"):
-        predict_path(MODEL, source, tmp_path / "apart.geojson", None)
 
 
 def test_bends_on_trusted_ground_are_no_warning(source, tmp_path):
@@ -103,23 +77,50 @@ def _request(source, **options) -> PlanPathOptions:
     return PlanPathOptions("model", tuple(start), tuple(goal), **options)
 
 
-def test_a_plan_is_found_once_and_again_when_its_picture_is_gone(source, tmp_path):
-    out, picture = tmp_path / "plan.geojson", tmp_path / "plan.png"
-    request = _request(source, objective="distance", cell_size_m=2.0, out=out, picture=picture)
-    first = plan(MODEL, source, request)
-    assert list(first.plans) == ["distance", "energy", "time"]
+def test_a_plan_is_written_with_its_messages_and_replaced_by_another(source, tmp_path):
+    out = tmp_path / "plan.geojson"
+    first = plan(MODEL, source, _request(source, objective="distance", cell_size_m=2.0, out=out))
     assert len(read_line(out)) == 2
-    second = plan(MODEL, source, request)
-    assert second.status == "unchanged"
-    assert list(second.plans) == list(first.plans)
-    assert "nothing to do" in str(second)
-    picture.unlink()
-    assert plan(MODEL, source, request).status == "done"
-    other = _request(source, objective="time", cell_size_m=2.0, out=out)
-    assert plan(MODEL, source, other).status == "done"
+    assert first.lonlat_deg == pytest.approx(read_line(out))
+    assert (first.nav2_path, first.nav2_waypoints) == (tmp_path / "plan.path.json", tmp_path / "plan.waypoints.json")
+    assert str(first).splitlines()[-3:] == [str(path) for path in (out, first.nav2_path, first.nav2_waypoints)]
+    plan(MODEL, source, _request(source, objective="time", cell_size_m=2.0, out=out))
     found = json.loads(out.read_text())["features"][0]["properties"]
     assert found["objective"] == "time"
     assert found["complete"]
+
+
+def test_messages_for_nav2_are_along_the_path_in_true_east_and_north(tmp_path):
+    """Read by the definitions of nav_msgs/Path and nav2_msgs/FollowGPSWaypoints; 2.9 degrees off the central meridian."""
+    source = plane(24.0, classes=lambda east, north: np.where((np.abs(east - 12.0) < 1.5) & (north < 16.0), 2, 4))
+    source = replace(source, grid=replace(source.grid, x_min_m=720_000.0))
+    ends = lonlat(source, (4.0, 4.0), (20.0, 4.0))
+    options = PlanPathOptions(
+        "model", *map(tuple, ends.tolist()), out=tmp_path / "p.geojson", origin_deg=tuple(ends[0].tolist())
+    )
+    found = plan(MODEL, source, options)
+    message = json.loads(found.nav2_path.read_text())
+    assert message["header"]["frame_id"] == "map"
+    poses = [pose["pose"] for pose in message["poses"]]
+    xy = np.array([[pose["position"]["x"], pose["position"]["y"]] for pose in poses])
+    steps = np.diff(xy, axis=0)
+    assert np.linalg.norm(steps, axis=1).max() <= 0.25 + 1e-6
+    assert np.linalg.norm(steps, axis=1).sum() == pytest.approx(found.length_m, rel=1e-4)
+    yaw = [2.0 * np.arctan2(pose["orientation"]["z"], pose["orientation"]["w"]) for pose in poses]
+    np.testing.assert_allclose(np.exp(1j * np.array(yaw[:-1])), np.exp(1j * np.arctan2(*steps.T[::-1])), atol=1e-9)
+    geod = pyproj.Geod(ellps="WGS84")
+    azimuth, _, away = geod.inv(*ends[0], *ends[1])
+    assert xy[0] == pytest.approx([0.0, 0.0], abs=1e-6)
+    assert xy[-1] == pytest.approx([away * np.sin(np.radians(azimuth)), away * np.cos(np.radians(azimuth))], abs=1e-3)
+    goal = json.loads(found.nav2_waypoints.read_text())
+    assert set(goal) == {"number_of_loops", "goal_index", "gps_poses"}
+    places = np.array([[pose["position"][name] for name in ("longitude", "latitude")] for pose in goal["gps_poses"]])
+    np.testing.assert_allclose(places, found.lonlat_deg[1:], atol=1e-9)
+    assert len(places) >= 2
+    for pose, start, end in zip(goal["gps_poses"], found.lonlat_deg[:-1], found.lonlat_deg[1:], strict=True):
+        yaw = 2.0 * np.arctan2(pose["orientation"]["z"], pose["orientation"]["w"])
+        course = np.radians(90.0 - geod.inv(*start, *end)[0])
+        assert np.exp(1j * yaw) == pytest.approx(np.exp(1j * course), abs=1e-3)
 
 
 def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(source, tmp_path):
@@ -129,7 +130,7 @@ def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(sour
         plan(MODEL, source, _request(source, cell_size_m=2.0, cost_map=given, out=tmp_path / name))
         for name, given in (("with.geojson", costs), ("without.geojson", None))
     ]
-    ours, theirs = (found.plans["energy"] for found in plans)
+    ours, theirs = plans
     assert ours.energy_joule == pytest.approx(theirs.energy_joule, rel=1e-9)
     with pytest.raises(ModelError, match="made from another model or map"):
         plan(replace(MODEL, checksum="1" * 64), source, _request(source, cost_map=costs, out=tmp_path / "p.json"))
@@ -141,9 +142,8 @@ def test_a_cost_map_of_other_cells_gives_another_plan_and_a_damaged_one_is_refus
     costs, out = tmp_path / "costs", tmp_path / "plan.geojson"
     request = _request(source, cost_map=costs, out=out)
     for cell_size_m in (2.0, 3.0):
-        make_cost_map(MODEL, source, costs, cell_size_m=cell_size_m)
-        assert plan(MODEL, source, request).status == "done"
-        assert plan(MODEL, source, request).status == "unchanged"
+        card = make_cost_map(MODEL, source, costs, cell_size_m=cell_size_m).card
+        assert plan(MODEL, source, request).predicted_cells == card.cells.all
     (costs / "cost-map.json").write_text("{}")
     with pytest.raises(ModelError, match="has changed since it was written"):
         plan(MODEL, source, request)
@@ -163,7 +163,5 @@ def test_names_and_points_that_cannot_be_are_one_line(source, path, tmp_path):
         predict_path(MODEL, source, path, tmp_path / "path-segments.xlsx")
     with pytest.raises(UsageError, match=r"ends in \.geojson"):
         plan(MODEL, source, _request(source, out=tmp_path / "plan.kml"))
-    with pytest.raises(UsageError, match=r"ends in \.png"):
-        plan(MODEL, source, _request(source, out=tmp_path / "plan.json", picture=tmp_path / "plan.svg"))
     with pytest.raises(PathError, match="no lon/lat"):
         plan(MODEL, source, PlanPathOptions("model", (200.0, 47.0), (15.0, 47.0), out=tmp_path / "plan.json"))

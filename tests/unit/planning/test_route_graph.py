@@ -3,10 +3,8 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
-import pyarrow as pa
 import pyproj
 import pytest
 from map_worlds import ArrayMap
@@ -15,9 +13,9 @@ from planning_worlds import NORTH_M, WEST_M, lonlat, plane
 from shared_data import shared_data
 
 from tcpipe.errors import PathError, UsageError
-from tcpipe.formats.maps.nav2 import make_route_graph, read_route_graph
+from tcpipe.formats.maps.nav2 import RouteEdge, RouteGraph, read_route_graph
 from tcpipe.planning.path_cost import compute_path_cost
-from tcpipe.planning.route_graph import connect_lines, write_route_graph
+from tcpipe.planning.route_graph import write_route_graph
 from tcpipe.terrain.target_grid import MapGrid
 
 MODEL = PhysicsModel()
@@ -64,7 +62,7 @@ def test_each_direction_costs_what_predict_path_says_and_nothing_else_changes(hi
     slow = {"speed_limit": 0.85, "aisle_number": 14, "door": {"id": 5}}
     edges = [_edge(9, 3, 7, metadata=slow, overridable=False, cost=10.0), _edge(10, 7, 3)]
     given = _write(tmp_path / "graph.geojson", *nodes, *edges, name="yard", crs={"type": "name"})
-    result = write_route_graph(MODEL, hill, tmp_path / "out.geojson", graph=given, store=None, origin_deg=origin)
+    result = write_route_graph(MODEL, hill, tmp_path / "out.geojson", graph=given, origin_deg=origin)
     assert (result.nodes, result.edges, result.one_way_edges, result.exit_code) == (2, 2, 0, 0)
     found = _load_as_nav2_does(tmp_path / "out.geojson")
     for way, ends in {(3, 7): [(4.0, 4.0), (14.0, 4.0)], (7, 3): [(14.0, 4.0), (4.0, 4.0)]}.items():
@@ -101,7 +99,7 @@ def test_edges_are_true_enu_lines_far_from_the_central_meridian(tmp_path):
     ends = [(20.0, 10.0), (300.0, 300.0)]
     nodes = [_feature("Point", list(at), id=number) for number, at in enumerate(ends)]
     given = _write(tmp_path / "graph.geojson", *nodes, _edge(5, 0, 1))
-    write_route_graph(model, ground, tmp_path / "out.geojson", graph=given, store=None, origin_deg=origin)
+    write_route_graph(model, ground, tmp_path / "out.geojson", graph=given, origin_deg=origin)
     found = _load_as_nav2_does(tmp_path / "out.geojson")[0, 1]
     enu = pyproj.Transformer.from_pipeline(
         f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={origin[0]!r} +lat_0={origin[1]!r} +h_0=0 "
@@ -120,7 +118,7 @@ def test_edges_without_a_cost_are_left_out_and_named_short_ones_have_one(hill, t
     given = _write(
         tmp_path / "g.json", *nodes, _edge(11, 1, 2), _edge(12, 1, 3), _edge(13, 1, 4), _edge(14, 4, 4), _edge(15, 1, 5)
     )
-    result = write_route_graph(MODEL, hill, tmp_path / "out.json", graph=given, store=None, two_way=True)
+    result = write_route_graph(MODEL, hill, tmp_path / "out.json", graph=given, two_way=True)
     assert result.edges_without_cost[:3] == (12, 13, 14)
     assert result.exit_code == 3
     assert "edges have no cost and are left out: 12, 13, 14" in str(result)
@@ -129,13 +127,11 @@ def test_edges_without_a_cost_are_left_out_and_named_short_ones_have_one(hill, t
     assert found[1, 2]["length_m"] == pytest.approx(0.3, rel=1e-3)
     assert found[1, 2]["energy_joule"] == pytest.approx(0.3 / 8.0 * found[1, 5]["energy_joule"], rel=0.02)
     steep = replace(MODEL, training_range=MODEL.training_range | {"slope_rad": (-0.5, 0.01)})
-    told = write_route_graph(steep, hill, tmp_path / "out.json", graph=given, store=None)
+    told = write_route_graph(steep, hill, tmp_path / "out.json", graph=given)
     assert told.unreliable_edges == 2
     assert _load_as_nav2_does(tmp_path / "out.json")[1, 5]["unreliable"] == "slope_outside_training"
     with pytest.raises(PathError, match="check the frame of the graph and --origin"):
-        write_route_graph(
-            MODEL, hill, tmp_path / "o.json", graph=_write(tmp_path / "h.json", *nodes, _edge(13, 1, 4)), store=None
-        )
+        write_route_graph(MODEL, hill, tmp_path / "o.json", graph=_write(tmp_path / "h.json", *nodes, _edge(13, 1, 4)))
 
 
 @pytest.mark.parametrize(
@@ -169,58 +165,7 @@ def test_files_that_are_no_graph_and_outputs_that_cannot_be(hill, tmp_path):
         read_route_graph(tmp_path / "gone.geojson")
     for out, words in (("graph.geojson", "is the graph itself"), ("graph.xml", "ends in .geojson or .json")):
         with pytest.raises(UsageError, match=words):
-            write_route_graph(MODEL, hill, tmp_path / out, graph=tmp_path / "graph.geojson", store=None)
-
-
-def test_a_proposed_graph_has_nodes_where_ways_meet_and_bend_and_edges_where_it_was_driven():
-    """A cross of two roads, one driven twice beside itself, and a corner: by hand five ends and a middle."""
-    rng = np.random.default_rng(0)
-    along = np.arange(0.0, 60.5)
-    flat = np.zeros_like(along)
-    lines = [np.stack([along, flat], axis=1), np.stack([60.0 - along, flat + 0.8], axis=1)]
-    lines += [np.stack([flat + 30.0, along - 30.0], axis=1)]
-    corner = np.concatenate([np.stack([along + 60.0, flat], axis=1), np.stack([flat + 120.0, along], axis=1)[1:]])
-    nodes, pairs = connect_lines([*(line + rng.normal(0.0, 0.05, line.shape) for line in lines), corner])
-    for place in ([0, 0], [30, 30], [30, -30], [120, 60], [30, 0], [120, 0]):
-        assert np.linalg.norm(nodes - place, axis=1).min() < 3.5
-    assert len(nodes) < 14
-    driven = np.concatenate([*lines, corner])
-    for a, b in pairs:
-        between = nodes[a] + np.linspace(0.0, 1.0, 50)[:, None] * (nodes[b] - nodes[a])
-        assert np.linalg.norm(between[:, None] - driven[None], axis=2).min(axis=1).max() < 2.0
-    reached, todo = {0}, [0]
-    while todo:
-        at = todo.pop()
-        new = {b if a == at else a for a, b in pairs if at in {a, b}} - reached
-        reached |= new
-        todo += new
-    assert len(reached) == len(nodes)
-
-
-def test_a_ring_is_proposed_as_a_ring():
-    angle = np.linspace(0.0, 2.0 * np.pi, 200)
-    nodes, pairs = connect_lines([20.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
-    assert len(pairs) == len(nodes) > 6
-    assert np.bincount(np.ravel(pairs)).tolist() == [2] * len(nodes)
-    lengths = np.linalg.norm(nodes[[a for a, _ in pairs]] - nodes[[b for _, b in pairs]], axis=1)
-    assert lengths.sum() == pytest.approx(2.0 * np.pi * 20.0, rel=0.05)
-
-
-def test_a_graph_is_proposed_from_runs_on_the_map_and_reads_as_one(hill, tmp_path):
-    north = np.arange(3.0, 20.0)
-    start, end = (lonlat(hill, *np.stack([np.full(16, 10.0), of], axis=1)) for of in (north[:-1], north[1:]))
-    columns = {"start_ns": np.arange(16), "position_std_m": np.full(16, 0.1)}
-    for name, at in (("start", start), ("end", end)):
-        columns |= {f"{name}_lon_deg": at[:, 0], f"{name}_lat_deg": at[:, 1]}
-    run = SimpleNamespace(segments=lambda: pa.table(columns))
-    store = SimpleNamespace(runs=lambda: [run], root="store")
-    result = write_route_graph(MODEL, hill, tmp_path / "out.json", graph=None, store=store)
-    found = read_route_graph(tmp_path / "out.json")
-    assert (result.nodes, result.edges, result.one_way_edges) == (2, 2, 0)
-    south_west = np.array([WEST_M, NORTH_M - 24.0])
-    np.testing.assert_allclose(list(found.nodes.values()) - south_west, [[10.0, 3.0], [10.0, 19.0]], atol=3.0)
-    with pytest.raises(UsageError, match="give a graph with --graph"):
-        write_route_graph(MODEL, hill, tmp_path / "o.json", graph=None, store=SimpleNamespace(runs=list, root="store"))
+            write_route_graph(MODEL, hill, tmp_path / out, graph=tmp_path / "graph.geojson")
 
 
 _OURS = Path(__file__).parents[2] / "data" / "route_graph.geojson"
@@ -241,7 +186,7 @@ def test_graphs_of_the_format_and_those_of_nav2_are_read_and_written_whole(name,
     shift = np.array([WEST_M, NORTH_M - side]) + 2.0 - xy_m.min(axis=0)
     origin = tuple(lonlat(ground, shift - [WEST_M, NORTH_M - side])[0].tolist())
     model = replace(MODEL, patch_px=8)
-    result = write_route_graph(model, ground, tmp_path / "out.geojson", graph=path, store=None, origin_deg=origin)
+    result = write_route_graph(model, ground, tmp_path / "out.geojson", graph=path, origin_deg=origin)
     costed = _load_as_nav2_does(tmp_path / "out.geojson")
     loops = [edge.edge_id for edge in found.edges if edge.start == edge.end]
     assert result.edges == len(found.edges) - len(loops)
@@ -260,8 +205,8 @@ def test_graphs_of_the_format_and_those_of_nav2_are_read_and_written_whole(name,
 
 
 def test_edges_back_have_new_ids():
-    graph = make_route_graph(np.array([[0.0, 0.0], [5.0, 0.0], [9.0, 0.0]]), [(0, 1), (1, 2)])
-    one_way = replace(graph, edges=graph.edges[:1] + graph.edges[2:])
-    back = one_way.list_missing_reverses()
-    assert [(of.edge_id, of.start, of.end) for of in back] == [(7, 1, 0)]
-    assert back[0].feature["geometry"]["coordinates"] == [(5.0, 0.0), (0.0, 0.0)]
+    edges = tuple(RouteEdge(number, start, end, {}) for number, start, end in ((3, 0, 1), (4, 1, 0), (5, 1, 2)))
+    graph = RouteGraph({}, [], {0: (0.0, 0.0), 1: (5.0, 0.0), 2: (9.0, 0.0)}, edges)
+    back = graph.list_missing_reverses()
+    assert [(of.edge_id, of.start, of.end) for of in back] == [(6, 2, 1)]
+    assert back[0].feature["geometry"]["coordinates"] == [(9.0, 0.0), (5.0, 0.0)]

@@ -1,4 +1,4 @@
-"""The picture of a plan: the paths of least energy, time and distance side by side on the shaded hill, coloured by energy a metre."""
+"""Draw paths of least energy, time and distance side by side on the shaded hill, coloured by energy a metre."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _crop(source: MapReader, xy_m: Array) -> Bounds:
 
 
 def _make_hill(source: MapReader, bounds: Bounds) -> Array:
-    """Return the orthophoto under shaded relief, tinted by class, RGB in [0, 1]; what has no data is white."""
+    """Return the orthophoto under shaded relief, tinted by class, RGB in [0, 1]; pixels without data are white."""
     left, bottom, right, top = bounds
     level = choose_level(source, max(right - left, top - bottom) / _PANEL_PX)
     corners = level.grid.px_from_xy(np.array([(left, top), (right, bottom)])) + 0.5

@@ -1,10 +1,4 @@
-"""The errors that the simulator itself implies: those of a predictor that knows its plant and reads the world without error.
-
-It sees what a map shows along the chord of a sample, where the pipeline believes the chord to be, and how much the robot turned. Of a
-world without hidden resistance it says what could be predicted at best: what remains is the labels' noise, that
-resistance, its fluctuation in time, and the lag of the wheels.
-
-Claims of the paper (section V) that the simulated site can refute, as ratios of errors.
+"""Claims of the paper (section V) that the simulated site can refute, as ratios of errors.
 
 The importance of height, class, several classes and slow ground is built into the site (docs/reference/simulation.md) and is no claim.
 """
@@ -18,69 +12,16 @@ from typing import Literal
 import numpy as np
 from scipy.special import stdtrit
 
-from tcpipe.dataset import Split
 from tcpipe.experiment.networks import ALL_LAYERS, GRASS, HEIGHTS
-from tcpipe.learning.baselines import SPLINE, SPLITS, TREES, BaselineResult
-from tcpipe.learning.metrics import Array, Ratio, compute_costs
-from tcpipe.simulation.robot import SimulatedRobot, compute_rolling_resistance
-from tcpipe.simulation.world import World
-
-_STEP_M = 0.05
-
-
-def compute_true_costs(world: World, robot: SimulatedRobot, split: Split) -> dict[str, Array]:
-    """Return w, v, T, E of every sample as the plant has it on the flat truth, shape (N,) each.
-
-    Parameters
-    ----------
-    world, robot : what was simulated.
-    split : samples, by the ends of their chords and their turn.
-    """
-    ends = [split.column(f"{end}_{axis}_deg").astype(np.float64) for end in ("start", "end") for axis in ("lon", "lat")]
-    x0, y0 = world.site.map_xy_m(ends[0], ends[1])
-    x1, y1 = world.site.map_xy_m(ends[2], ends[3])
-    half = robot.wheelbase_m / 2.0
-    along = np.arange(-half, 1.0 + half + _STEP_M / 2.0, _STEP_M)
-    x = x0[:, None] + (x1 - x0)[:, None] * along
-    y = y0[:, None] + (y1 - y0)[:, None] * along
-    direction = np.arctan2(y1 - y0, x1 - x0)[:, None]
-    scale, _ = world.site.ground_from_map(x.ravel(), y.ravel(), (world.height_m(x, y) + world.site.geoid_m).ravel())
-    rise_x, rise_y = world.gradient(x, y)
-    slope = np.arctan((rise_x * np.cos(direction) + rise_y * np.sin(direction)) / np.reshape(scale, x.shape))
-    ground = robot.ground_table()[world.terrain_class(x, y)]
-    usual = [_mean_over(ground[..., column], round(robot.wheelbase_m / _STEP_M) + 1) for column in range(3)]
-    cut = slice((x.shape[1] - usual[0].shape[1]) // 2, (x.shape[1] + usual[0].shape[1]) // 2)
-    slope = slope[:, cut]
-    rolling = compute_rolling_resistance(world, robot, x[:, cut], y[:, cut], direction)
-    lost = 0.0 if robot.wheels is None else robot.wheels.slowdown * (rolling - usual[2])
-    wheel = robot.max_velocity_mps * robot.speed_factor(usual[0], np.sin(slope)) * (1.0 - lost)
-    velocity = wheel * (1.0 - robot.slip(usual[1], np.sin(slope))) * np.cos(slope)
-    turning = np.abs(np.nan_to_num(split.column("mean_abs_yaw_rate_radps").astype(np.float64)))
-    mechanical = robot.wheel_power_watt(
-        wheel_velocity_mps=wheel,
-        acceleration_mps2=np.zeros_like(slope),
-        yaw_rate_radps=np.broadcast_to(turning[:, None], slope.shape),
-        slope_rad=slope,
-        rolling_resistance=rolling,
-    )
-    power = robot.propulsion_watt(mechanical, wheel)
-    seconds_per_m = np.mean(1.0 / velocity, axis=1)
-    joule_per_m = np.mean(power / velocity, axis=1)
-    return compute_costs(joule_per_m / seconds_per_m, 1.0 / seconds_per_m, 1.0)
-
-
-def _mean_over(values: Array, count: int) -> Array:
-    """Return the running mean of ``count`` neighbours, shape (N, K - count + 1)."""
-    sums = np.cumsum(np.pad(values, ((0, 0), (1, 0))), axis=1)
-    return np.asarray((sums[:, count:] - sums[:, :-count]) / count)
-
+from tcpipe.learning.baselines import CURVES, SPLITS, TREES, BaselineResult
+from tcpipe.learning.metrics import Ratio
 
 Verdict = Literal["held", "open", "NOT held", "not measured"]
 
 CLAIMS = {
     ALL_LAYERS: "one net beats a net per class, all layers",
     HEIGHTS: "one net beats a net per class, heights alone",
-    SPLINE: "the net beats class and slope",
+    CURVES: "the net beats class and slope",
     TREES: "the net beats gradient boosting",
 }
 """By the baseline; each is of E, on every split."""
@@ -105,7 +46,7 @@ class Claim:
     """Standard deviation of the ratio's logarithm between trainings; None of one."""
     in_the_paper: float | None
     verdict: Verdict
-    """``held``: the whole 95 % interval lies below 1; ``NOT held``: above; ``open``: it holds 1, or trainings or groups are too few."""
+    """``held``: the whole 95 % interval is below 1; ``NOT held``: above; ``open``: it contains 1, or trainings or groups are too few."""
 
     def __str__(self) -> str:
         """Return the claim, its figure and its verdict as one line."""
