@@ -54,9 +54,9 @@ test: .venv/installed-dev
 check-and-train: check
 	$(if $(TORCH),$(MAKE) .venv/installed-train)
 
-# Each program of benchmarks/ once, at its smallest size; some minutes on two cores.
+# Each program of benchmarks/ once, at its smallest size, and the tests of the campaign and the honesty gate; some minutes on two cores.
 test-benchmarks: .venv/installed-dev
-	$(BIN)/pytest benchmarks/test_benchmarks.py $(PYTEST)
+	$(BIN)/pytest benchmarks/test_*.py $(PYTEST)
 
 # Kills and interruptions at every request of calls on one store; about an hour on two cores.
 test-operations: .venv/installed-dev
