@@ -171,20 +171,6 @@ def test_a_bag_with_a_destroyed_chunk_head_goes_on_behind_it(tmp_path):
     assert any(finding.numbers.get("lost_bytes") for finding in damage)
 
 
-def test_a_cut_db3_gives_the_rows_before_the_cut(tmp_path):
-    messages = random_messages(4, count=400, types=("sensor_msgs/msg/Imu", "sensor_msgs/msg/PointCloud2"))
-    bag = write_rosbag2(tmp_path / "run", messages)
-    path = next(bag.glob("*.db3"))
-    data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * 0.6)])
-    tables, damage = read(bag)
-    found = sum(table.num_rows for table in tables.values())
-    assert 0.5 * len(messages) < found < 0.7 * len(messages)
-    assert len(messages) - found in [finding.numbers.get("lost_messages_count") for finding in damage]
-    for topic in tables:
-        assert_same(tables[topic], expected_columns(messages[:found], topic))
-
-
 def test_texts_that_are_not_utf8_are_replaced_and_counted(tmp_path):
     messages = random_messages(7, count=10, types=("std_msgs/msg/String",))
     payload = b"\x00\x01\x00\x00\x03\x00\x00\x00a\xff\x00"
@@ -238,20 +224,6 @@ def test_a_broken_metadata_file_costs_nothing(tmp_path, content):
     assert [(of.code, of.severity) for of in damage] == [("file-unlisted", "note"), ("no-checksum", "note")]
     for topic in tables:
         assert_same(tables[topic], expected_columns(messages, topic))
-
-
-def test_rows_that_are_no_messages_cost_only_themselves(tmp_path):
-    messages = random_messages(5, count=20, types=("std_msgs/msg/ColorRGBA",))
-    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
-    with closing(sqlite3.connect(path)) as database, database:
-        database.execute("UPDATE messages SET timestamp = 'abc' WHERE id = 3")
-        database.execute("UPDATE messages SET data = 'text' WHERE id = 5")
-        database.execute("UPDATE messages SET topic_id = 99 WHERE id IN (7, 8)")
-    database.close()
-    with open_log(path) as log:
-        assert log.topics["/ColorRGBA"].message_count == 16
-        assert log.table("/ColorRGBA").num_rows == 16
-        assert count_lost(log.findings) == {"channel-undeclared": 2, "record-damaged": 2}
 
 
 WRONG_VALUES = ("NULL", "'text'", "x'00'", "2.5", "NULL, topic_id = 'x'", "NULL, data = NULL")

@@ -1,21 +1,25 @@
-"""Logs made to hurt: each is refused or set aside by name, in bounded time and memory, and costs nothing else."""
+"""Logs made to take all memory or time: each is read or refused by name, in bounded time and memory, and costs no other topic."""
 
+import bz2
+import json
+import os
 import sqlite3
 import struct
-import time
-import tracemalloc
+import subprocess
+import sys
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import lz4.frame
 import pytest
 import zstandard
+from autopilot_files import DataFlash, Ulog
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from random_messages import (
     ROS1,
     ROS2,
-    START_NS,
     Message,
     assert_same,
     expected_columns,
@@ -27,27 +31,252 @@ from random_messages import (
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import CompressionMode
 
-from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.log_part import DamageError, decompress, is_bomb
-from tcpipe.formats.logs.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets
+
+START_NS = 1_700_000_000_000_000_000
+MOST_SECONDS, MOST_BYTES = 10, 1 << 30
+COLOR = "float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n"
 
 TYPES = ("std_msgs/msg/ColorRGBA",)
-BOMB_BYTES = 1 << 29
-MOST_SECONDS = 20
-MOST_BYTES = 100 << 20
+
+READ = """
+import json, re, sys, time
+from click.testing import CliRunner
+from tcpipe.cli import cli
+from tcpipe.errors import TcpipeError
+
+def most_bytes():  # getrusage's would hold what the parent had before this program was begun
+    with open("/proc/self/status") as status:
+        return int(re.search(r"VmHWM:\\s+(\\d+)", status.read())[1]) * 1024
+
+for path in sys.argv[1:]:
+    for command, *options in (("inspect", "--full"), ("ingest", "--store", path + "-store")):
+        start = time.process_time()
+        done = CliRunner().invoke(cli, [command, path, *options], standalone_mode=False)
+        error = done.exception
+        raw = "" if error is None or isinstance(error, TcpipeError) else f"raw: {type(error).__name__}: "
+        said = f"{done.output}{raw}{error}"
+        print(json.dumps([path, command, said, time.process_time() - start, most_bytes()]), flush=True)
+        if error is not None:
+            break  # `ingest` opens it in the same way
+"""
 
 
-@pytest.fixture
-def bounded():
-    """The test takes neither long nor much memory."""
-    tracemalloc.start()
-    start = time.process_time()
-    yield
-    seconds, peak = time.process_time() - start, tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert seconds < MOST_SECONDS
-    assert peak < MOST_BYTES
+def record(opcode, content):
+    return bytes([opcode]) + struct.pack("<Q", len(content)) + content
+
+
+def text(value):
+    return struct.pack("<I", len(value)) + value
+
+
+def schema(number, definition, name=b"acme_msgs/msg/Thing"):
+    return record(3, struct.pack("<H", number) + text(name) + text(b"ros2msg") + text(definition.encode()))
+
+
+def channel(number, of, topic):
+    return record(4, struct.pack("<HH", number, of) + text(topic.encode()) + text(b"cdr") + struct.pack("<I", 0))
+
+
+def message(number, payload=b""):
+    return record(5, struct.pack("<HIQQ", number, 0, START_NS, START_NS) + payload)
+
+
+def chunk(codec, size, data):
+    head = struct.pack("<QQQI", START_NS, START_NS, size, 0) + text(codec.encode())
+    return record(6, head + struct.pack("<Q", len(data)) + data)
+
+
+def squeezed(data):
+    return chunk("zstd", len(data), zstandard.compress(data))
+
+
+GOOD = schema(1, COLOR, b"std_msgs/msg/ColorRGBA") + channel(1, 1, "/good")
+
+
+def mcap(*records):
+    return lambda path: path.write_bytes(b"\x89MCAP0\r\n" + GOOD + b"".join(records))
+
+
+def one_topic(definition, payload):
+    return mcap(schema(2, definition), channel(2, 2, "/evil"), message(2, payload))
+
+
+def db3(*statements):
+    def write(path):
+        with closing(sqlite3.connect(path)) as database, database:
+            database.execute(
+                "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)"
+            )
+            database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB)")
+            for statement in statements:
+                database.execute(statement)
+
+    return write
+
+
+def counted(values, table, most):
+    numbers = f"WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < {most})"  # noqa: S608
+    return f"{numbers} INSERT INTO {table} SELECT {values} FROM n"  # noqa: S608
+
+
+def bag_record(opcode, data, **fields):
+    held = [b"op=" + bytes([opcode]), *(name.encode() + b"=" + value for name, value in fields.items())]
+    head = b"".join(text(field) for field in held)
+    return text(head) + text(data)
+
+
+def bag(*records):
+    head = bag_record(3, bytes(4000), index_pos=bytes(8), conn_count=bytes(4), chunk_count=bytes(4))
+    return lambda path: path.write_bytes(b"#ROSBAG V2.0\n" + head + b"".join(records))
+
+
+def bag_chunk(data, codec=b"none", size=None):
+    return bag_record(5, data, compression=codec, size=struct.pack("<I", len(data) if size is None else size))
+
+
+def bag_connection(number):
+    return bag_record(7, b"", conn=struct.pack("<I", number), topic=b"/t")
+
+
+def directory(metadata, files=1):
+    def write(path):
+        path.mkdir()
+        mcap()(path / "evil_0.mcap")
+        for number in range(1, files):
+            (path / f"evil_{number}.mcap").symlink_to(path / "evil_0.mcap")
+        if metadata:
+            (path / "metadata.yaml").write_text(metadata)
+
+    return write
+
+
+def linked(path):
+    path.mkdir()
+    mcap(message(1))(path / "a.mcap")
+    for number in range(4):
+        (path / f"again{number}").symlink_to(path)
+    at = os.open(path, os.O_RDONLY)
+    for _ in range(1500):  # deeper than Python calls functions
+        os.mkdir("d", dir_fd=at)
+        below = os.open("d", os.O_RDONLY, dir_fd=at)
+        os.close(at)
+        at = below
+    os.close(at)
+
+
+def ulog(*formats, data=b"", names=None):
+    """Write formats, a subscription to each of the names, and data."""
+    log = Ulog()
+    for text in formats:
+        log.message("F", text.encode())
+    for number, name in enumerate(names or [text.partition(":")[0] for text in formats]):
+        log.subscribe(name, number % 65_536)
+    return lambda path: path.write_bytes(log.bytes() + data)
+
+
+def ulog_data(number):
+    return struct.pack("<HBHQ", 10, 68, number, 1)
+
+
+def dataflash_format(number):
+    return b"\xa3\x95\x80" + struct.pack("<BB84s", number % 256, 2 + number % 3, b"a" * 84)
+
+
+def dataflash(data):
+    log = DataFlash()
+    log.format("ABC", "QB", "TimeUS,I")
+    return lambda path: path.write_bytes(log.bytes() + data)
+
+
+LISTS = "A[] a\n" + "=" * 80 + "\nMSG: acme_msgs/A\nuint8[] b\n"
+MANY = [f"a{number}:uint64_t timestamp;" for number in range(11_000)]
+WIDE = "".join(f"int8 f{number}\n" for number in range(9000))
+COMPUTED = "id INTEGER PRIMARY KEY, topic_id, timestamp, data GENERATED ALWAYS AS (zeroblob(900000000))"
+TOPIC = "INSERT INTO topics VALUES (0, '/t', 'a/msg/A', 'cdr')"
+BOMB = "taken for a bomb"
+SEPARATOR = "=" * 80 + "\n"
+LEVELS = "L0 part\n" + "".join(f"{SEPARATOR}MSG: acme_msgs/L{n}\nL{n + 1} part\n" for n in range(3000))
+CHUNK_HEAD = b"\x06" + struct.pack("<QQQQIIQ", 40, 0, 0, 1 << 61, 0, 0, 0) + b"\xff"
+NUMBERS = "WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)"
+ENDLESS = f"{NUMBERS} SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"  # noqa: S608
+LAUGHS = "a0: &a0 [x, x]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 12))
+LAUGHS += "rosbag2_bagfile_information:\n  relative_file_paths: [*a11, *a11]\n"
+HOSTILE = {
+    "empty records, compressed": (lambda: mcap(squeezed(record(0x0D, b"") * 1_200_000)), BOMB),
+    "messages of nothing, compressed": (lambda: mcap(squeezed(message(1) * 150_000)), "are not decoded"),
+    "schemas, compressed": (lambda: mcap(squeezed(schema(9, "", b"") * 300_000)), ""),
+    "a chunk of 1 GB": (lambda: mcap(chunk("lz4", 1 << 30, lz4.frame.compress(bytes(1 << 28)))), "a length, type or field is impossible"),
+    "many chunks of 64 MB": (lambda: mcap(chunk("zstd", 1 << 26, zstandard.compress(bytes(1 << 26))) * 40), BOMB),
+    "indexes of every channel": (lambda: mcap(chunk("", 0, b""), *(record(7, struct.pack("<HI", n, 0)) for n in range(1 << 16))), ""),
+    "channels": (lambda: mcap(*(channel(n, 1, f"/t{n}") + message(n) for n in range(2, 10_100))), "more than 10000 topics"),
+    "columns": (lambda: mcap(*(schema(n, WIDE) + channel(n, n, f"/t{n}") for n in range(2, 40))), "200000 columns"),
+    "a definition of 6 MB": (lambda: one_topic("int8 x\n" * 900_000, b""), "bytes, more than"),
+    "lists of lists": (lambda: one_topic(LISTS, b"\0\1\0\0" + struct.pack("<I", 100_000) + bytes(400_000)), ""),
+    "topics.db3": (lambda: db3(counted("i, 't' || i, 'a/msg/A', 'cdr'", "topics", 1_000_000)), BOMB),
+    "unknown ids.db3": (lambda: db3(TOPIC, counted("i, i, i, x'00'", "messages", 100_000)), "that no record declares"),
+    "computed.db3": (lambda: db3("DROP TABLE messages", f"CREATE TABLE messages({COMPUTED})"), "no plain table"),
+    "records.bag": (lambda: bag(bag_chunk(bz2.compress(bytes(12_000_000)), b"bz2", 12_000_000)), BOMB),
+    "claims.bag": (lambda: bag(bag_chunk(lz4.frame.compress(bytes(1 << 28)), b"lz4", 1 << 31)), "a length, type or field is impossible"),
+    "connections.bag": (lambda: bag(bag_chunk(b"".join(map(bag_connection, range(70_000))))), BOMB),
+    "long metadata": (lambda: directory("x: [1, 2]\n" * 300_000), "metadata.yaml is missing, unusable or without this file"),
+    "files": (lambda: directory("a: 1", 4200), "bags of up to 4096 are read"),
+    "names of files": (lambda: directory("rosbag2_bagfile_information:\n  relative_file_paths:\n" + "  - a\n" * 5000), "names 5000 files"),
+    "links": (lambda: linked, ""),
+    "lists.ulg": (lambda: ulog("a:b[60000] b;", "b:c[60000] c;", "c:double[60000] d;"), "longer than any can be"),
+    "itself.ulg": (lambda: ulog("a:uint64_t timestamp;a[2] a;"), "formats inside formats"),
+    "formats.ulg": (lambda: ulog(*(f"a{n}:uint64_t timestamp;b b;" for n in range(3000)), "b:" + "int8_t[9] " + "x;"), ""),
+    "columns.ulg": (lambda: ulog(*(f"a{n}:" + "".join(f"int8_t x{i};" for i in range(5000)) for n in range(60))), "200000 columns"),
+    "topics.ulg": (lambda: ulog(*MANY, data=b"".join(map(ulog_data, range(11_000)))), "more than 10000 topics"),
+    "pieces.ulg": (lambda: ulog("a:uint64_t timestamp;", data=(ulog_data(0) + b"D") * 100_000), "a record is damaged"),
+    "heads.ulg": (lambda: ulog("a:uint64_t timestamp;", data=b"D" * 10_000_000), "the file ends inside"),
+    "unknown.ulg": (lambda: ulog(*(["a:uint64_t timestamp;"] * 2), names=[f"b{n}" for n in range(30_000)]), "is damaged"),
+    "heads.bin": (lambda: dataflash(b"\xa3\x95\x81" * 3_000_000), "no valid time"),
+    "pieces.bin": (lambda: dataflash((b"\xa3\x95\x81" + bytes(9) + b"\xa3\x95\x81" + bytes(9) + b"x") * 50_000), "a record is damaged"),
+    "formats.bin": (lambda: dataflash(b"".join(map(dataflash_format, range(10_000)))), ""),
+    "itself": (lambda: one_topic("Other other\n" + SEPARATOR + "MSG: acme_msgs/Other\nThing thing\n", b""), "contains itself"),
+    "an array of 4e9": (lambda: one_topic("float64[4000000000] values\n", b""), "of 4000000000 elements is longer than any message"),
+    "an array of 2e8": (lambda: one_topic("float64[200000000] values\n", b""), "1 message"),
+    "1e20 texts": (lambda: one_topic("string[99999999999999999999] texts\n", b""), "longer than any message"),
+    "1e9 texts": (lambda: one_topic("string[1000000000] texts\n", b""), "contains 1000000000 texts or messages in arrays"),
+    "1e6 texts": (lambda: one_topic(f"Part[1000] parts\n{SEPARATOR}MSG: acme_msgs/Part\nstring[1000] texts\n", b""), "1000000 texts"),
+    "3000 levels": (lambda: one_topic(LEVELS, b""), "nests more than 64 messages"),
+    "half a definition": (lambda: one_topic("float64 { x\n", b""), "cannot be parsed"),
+    "a chunk of 2 to the 60": (lambda: mcap(chunk("zstd", 1 << 60, zstandard.compress(b""))), "a length, type or field is impossible"),
+    "heads of chunks": (lambda: lambda path: path.write_bytes(b"\x89MCAP0\r\n" + CHUNK_HEAD * 20_000), ""),
+    "heads of chunks.bag": (lambda: lambda path: path.write_bytes(b"#ROSBAG V2.0\n" + b"\x04\0\0\0op=\x05" * 60_000), ""),
+    "view.db3": (lambda: db3("DROP TABLE messages", f"CREATE VIEW messages AS {ENDLESS}"), "'messages' is no plain table"),
+    "bomb.db3.zstd": (lambda: lambda path: path.write_bytes(zstandard.compress(bytes(1 << 29))), BOMB),
+    "metadata that unfolds": (lambda: directory(LAUGHS), "metadata.yaml is missing, unusable or without this file"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory):
+    place = tmp_path_factory.mktemp("hostile")
+    for name, (make, _) in HOSTILE.items():
+        make()(place / name)
+    paths = [str(place / name) for name in HOSTILE]
+    done = subprocess.run([sys.executable, "-c", READ, *paths], capture_output=True, text=True, check=False)
+    subprocess.run(["rm", "-rf", place], check=True)  # Python, which pytest clears up with, cannot go so deep
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = {}
+    for line in done.stdout.splitlines():
+        path, what, said, seconds, most_bytes = json.loads(line)
+        found.setdefault(Path(path).name, []).append((what, said, seconds, most_bytes))
+    return found
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_log_is_read_or_refused_in_bounded_time_and_memory(outcomes, name):
+    _, wanted = HOSTILE[name]
+    for what, said, seconds, most_bytes in outcomes[name]:
+        assert seconds < MOST_SECONDS, what
+        assert most_bytes < MOST_BYTES, what
+        assert "raw: " not in said, (what, said)
+        assert "internal error" not in said, (what, said)
+    assert wanted in " ".join(said for _, said, *_ in outcomes[name])
 
 
 def read(path):
@@ -69,76 +298,17 @@ def write_topics(path, topics, version=2):
     return path
 
 
-def write_evil(path, definition):
-    """Write a log of one good topic, and one with this definition."""
-    messages = [(of.log_time_ns, of.payload) for of in random_messages(1, count=5, types=TYPES)]
-    good, _ = ROS2.generate_msgdef(TYPES[0], ros_version=2)
-    topics = [("/good", TYPES[0], good, messages), ("/evil", "acme_msgs/msg/Thing", definition, messages)]
-    return write_topics(path, topics)
-
-
-@pytest.mark.parametrize(
-    ("definition", "said"),
-    [
-        ("Other other\n" + "=" * 80 + "\nMSG: acme_msgs/Other\nThing thing\n", "contains itself"),
-        ("float64[4000000000] values\n", "an array of 4000000000 elements is longer than any message"),
-        ("string[99999999999999999999] texts\n", "longer than any message"),
-        (
-            "L0 part\n" + "".join(f"{'=' * 80}\nMSG: acme_msgs/L{n}\nL{n + 1} part\n" for n in range(3000)),
-            "nests more than 64 messages",
-        ),
-        ("string[1000000000] texts\n", "contains 1000000000 texts or messages in arrays of fixed length"),
-        (
-            "Part[1000] parts\n" + "=" * 80 + "\nMSG: acme_msgs/Part\nstring[1000] texts\n",
-            "contains 1000000 texts or messages in arrays of fixed length",
-        ),
-        ("float64 { x\n", "cannot be parsed"),
-        ("", "is unknown"),
-    ],
-)
-def test_a_hostile_definition_costs_its_topic_only(tmp_path, bounded, definition, said):
-    tables, damage = read(write_evil(tmp_path / "a.mcap", definition))
-    assert set(tables) == {"/good"}
-    assert tables["/good"].num_rows == 5
-    (finding,) = damage
-    assert (finding.subject.name, finding.numbers["lost_messages_count"]) == ("/evil", 5)
-    assert said in finding.names["reason"]
-
-
-def test_a_fixed_array_that_no_message_can_hold_is_counted(tmp_path, bounded):
-    tables, damage = read(write_evil(tmp_path / "a.mcap", "float64[200000000] values\n"))
-    assert tables["/evil"].num_rows == 0
-    assert sum(finding.numbers["lost_messages_count"] for finding in damage) == 5
-
-
-@pytest.mark.parametrize("with_summary", [True, False])
-def test_a_chunk_that_claims_2_to_the_60_bytes(tmp_path, bounded, with_summary):
-    messages = random_messages(2, count=200, types=TYPES)
-    path = write_mcap(tmp_path / "a.mcap", messages, chunk_bytes=512)
-    data = bytearray(path.read_bytes())
-    chunks = [
-        offset + 8 for offset in record_offsets(bytes(data[8:]), len(data))[0].tolist() if data[offset + 8] == OP_CHUNK
-    ]
-    if not with_summary:
-        del data[chunks[-1] :]
-    struct.pack_into("<Q", data, chunks[1] + RECORD_HEAD + 16, 1 << 60)
-    path.write_bytes(data)
-    tables, damage = read(path)
-    assert 150 < tables["/ColorRGBA"].num_rows <= 200
-    assert with_summary or "record-damaged" in {finding.code for finding in damage}
-
-
 @pytest.mark.parametrize(
     ("codec", "compress"), [("zstd", zstandard.compress), ("lz4", lz4.frame.compress)], ids=["zstd", "lz4"]
 )
-def test_a_bomb_of_a_chunk_is_refused_by_what_it_claims_and_by_what_it_holds(bounded, codec, compress):
+def test_a_bomb_of_a_chunk_is_refused_by_what_it_claims_and_by_what_it_holds(codec, compress):
     piece = bytes(1 << 24)
     bomb = compress(piece)
     with pytest.raises(DamageError):
         decompress(codec, memoryview(bomb), 1000)  # it claims little and holds much
     if codec == "zstd":
         with pytest.raises(DamageError, match="record-damaged"):
-            decompress(codec, memoryview(bomb), BOMB_BYTES)
+            decompress(codec, memoryview(bomb), 1 << 29)
     assert len(decompress(codec, memoryview(bomb), len(piece))) == len(piece)
 
 
@@ -149,74 +319,22 @@ def test_less_is_believed_of_what_is_held_as_a_whole():
     assert not is_bomb(4 << 20, 200 << 20, whole=True)
 
 
-def test_bombs_of_messages_and_of_files(tmp_path, bounded):
+def test_a_bomb_of_a_message_costs_itself(tmp_path):
     messages = random_messages(3, count=20, types=TYPES)
     bag = write_rosbag2(tmp_path / "run", messages, compression=CompressionMode.MESSAGE)
     database = next(bag.glob("*.db3"))
     compressor = zstandard.ZstdCompressor().compressobj()
-    bomb = b"".join([*(compressor.compress(bytes(1 << 20)) for _ in range(BOMB_BYTES >> 20)), compressor.flush()])
+    bomb = b"".join([*(compressor.compress(bytes(1 << 20)) for _ in range(512)), compressor.flush()])
     with closing(sqlite3.connect(database)) as connection, connection:
         connection.execute("UPDATE messages SET data = ? WHERE id = 7", (bomb,))
     connection.close()
     tables, damage = read(bag)
     assert tables["/ColorRGBA"].num_rows == 19
     assert [finding.numbers["lost_messages_count"] for finding in damage if finding.severity != "note"] == [1]
-    whole = tmp_path / "bomb.db3.zstd"
-    whole.write_bytes(bomb)
-    with pytest.raises(LogError, match="taken for a bomb"):
-        open_log(whole)
-
-
-def test_metadata_that_unfolds_without_bound(tmp_path, bounded):
-    bag = write_rosbag2(tmp_path / "run", random_messages(4, count=5, types=TYPES))
-    laughs = "a0: &a0 [x, x]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 12))
-    (bag / "metadata.yaml").write_text(laughs + "rosbag2_bagfile_information:\n  relative_file_paths: [*a11, *a11]\n")
-    tables, damage = read(bag)
-    assert tables["/ColorRGBA"].num_rows == 5
-    assert {finding.severity for finding in damage} == {"note"}
-
-
-def test_a_view_in_place_of_a_table_is_refused(tmp_path, bounded):
-    path = tmp_path / "a.db3"
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute(
-            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)"
-        )
-        connection.execute(
-            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) "
-            "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"
-        )
-    connection.close()
-    with pytest.raises(LogError, match="'messages' is no plain table"):
-        open_log(path)
-
-
-def test_a_database_that_claims_to_be_endless_is_read_as_far_as_it_goes(tmp_path, bounded):
-    path = next(write_rosbag2(tmp_path / "run", random_messages(5, count=5, types=TYPES)).glob("*.db3"))
-    data = bytearray(path.read_bytes())
-    data[28:32] = b"\xff\xff\xff\xff"
-    path.write_bytes(data)
-    with open_log(path) as log:
-        assert sum(table.num_rows for table in log.tables(log.topics).values()) == 5
-        assert any("the file ends" in line for line in log.damage)
-
-
-def test_a_file_full_of_what_looks_like_chunks_is_searched_in_linear_time(tmp_path, bounded):
-    head = bytes([OP_CHUNK]) + struct.pack("<QQQQIIQ", 40, 0, 0, 1 << 61, 0, 0, 0)
-    mcap = tmp_path / "a.mcap"
-    mcap.write_bytes(b"\x89MCAP0\r\n" + (head + b"\xff") * 20_000)
-    with open_log(mcap) as log:
-        assert log.topics == {}
-        assert log.damage
-    bag = tmp_path / "a.bag"
-    bag.write_bytes(b"#ROSBAG V2.0\n" + b"\x04\0\0\0op=\x05" * 60_000)
-    with open_log(bag) as log:
-        assert log.topics == {}
-        assert log.damage
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
-def test_lengths_and_counts_of_2_to_the_32(tmp_path, bounded, encoding):
+def test_lengths_and_counts_of_2_to_the_32(tmp_path, encoding):
     store, write, suffix = (ROS2, write_mcap, "mcap") if encoding == "cdr" else (ROS1, write_bag, "bag")
     messages = random_messages(6, count=60, ragged=True, types=("sensor_msgs/msg/JointState",), store=store)
     evil, kept = [], []
@@ -233,7 +351,7 @@ def test_lengths_and_counts_of_2_to_the_32(tmp_path, bounded, encoding):
 
 
 @pytest.mark.parametrize("nothing", ["", "float64[0] none\n"])
-def test_arrays_whose_elements_take_no_bytes_are_refused(tmp_path, bounded, nothing):
+def test_arrays_whose_elements_take_no_bytes_are_refused(tmp_path, nothing):
     definition = "Nothing[] many\n" + "=" * 80 + f"\nMSG: acme_msgs/Nothing\n{nothing}"
     topics = [("/evil", "acme_msgs/Thing", definition, [(1, b"\xff\xff\xff\xff")])]
     path = write_topics(tmp_path / "a.mcap", topics, version=1)
