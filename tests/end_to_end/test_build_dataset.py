@@ -102,18 +102,6 @@ def test_every_footprint_is_where_its_split_says(samples):
     }
 
 
-def test_test_is_whole_blocks_near_a_fifth(samples):
-    split = samples["split"].to_numpy()
-    inside = np.isin(split, ("train", "test"))
-    start, end = ends_xy(samples)
-    blocks = np.floor((start + end)[inside] / 2 / 10.0).astype(int)
-    test = split[inside] == "test"
-    held = {tuple(block) for block in blocks[test]}
-    assert held
-    assert held.isdisjoint({tuple(block) for block in blocks[~test]})
-    assert 0.1 < test.mean() < 0.3
-
-
 def test_rows_are_shuffled_and_labels_belong_to_their_place(built, samples):
     start, _ = ends_xy(samples)
     np.testing.assert_allclose(samples["power_watt"].to_numpy(), 150 + start[:, 0] - WORLD.x_m, atol=1e-6)
@@ -250,25 +238,6 @@ def test_duckdb_reads_the_shards_as_they_are(built, samples):
         assert [row[2] for row in rows] == part.samples["power_watt"].to_pylist()
         terrain = part.layers(np.arange(len(part)))["terrain"]
         assert np.array_equal(np.array([row[3] for row in rows]), terrain.reshape(len(rows), -1))
-
-
-def test_polars_and_xarray_see_one_order(built, samples):
-    import polars as pl
-    import xarray
-
-    assert (
-        pl.read_parquet(built[0] / "zarr" / "samples.parquet")["sample_id"].to_list()
-        == samples["sample_id"].to_pylist()
-    )
-    patches = xarray.open_zarr(built[0] / "zarr" / "patches.zarr")
-    assert dict(patches.sizes) == {"sample": 448, "row": 40, "column": 40}
-    assert patches.height.attrs["units"] == "m"
-    assert patches.height.encoding["scale_factor"] == 0.0005
-    assert patches.sample_id.values.tolist() == samples["sample_id"].to_pylist()
-    train = samples["split"].to_numpy() == np.array("train")
-    shard = pl.read_parquet(shards(built[0], "train"))
-    decoded = shard["height"].to_numpy().reshape(-1, 40, 40) * 0.0005
-    np.testing.assert_allclose(patches.height.values[train], decoded, atol=1e-6)
 
 
 def test_every_file_of_samples_tells_where_its_rows_lie(built, samples):

@@ -41,15 +41,6 @@ def ids(work):
     return pq.read_table(work / "dataset" / "samples.parquet")["sample_id"].to_pylist()
 
 
-def test_verify_reads_everything_again(work):
-    for path, kind in (("dataset", "dataset"), ("tcpipe-store", "store")):
-        done = tcpipe("verify", path, cwd=work)
-        assert done.returncode == 0, done.stdout
-        (line,) = done.stdout.splitlines()
-        assert f": {kind}; " in line
-        assert line.endswith("no changes found")
-
-
 def test_verify_names_what_is_wrong_one_line_each_and_fails(work):
     path = work / "dataset" / "samples.parquet"
     whole = path.read_bytes()

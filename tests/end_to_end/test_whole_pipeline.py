@@ -16,7 +16,7 @@ from scipy.interpolate import CubicHermiteSpline
 import tcpipe as package
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.geometry.rotation import rpy_from_quat, wrap_to_pi
-from tcpipe.simulation import Truth, compute_true_cost, find_scenario, read_truth
+from tcpipe.simulation import Truth, compute_true_cost, read_truth
 from tcpipe.store import Store
 from tcpipe.tables.bits import DropReason
 
@@ -159,30 +159,6 @@ def test_steadily_driven_metres_become_segments(drives: Drives) -> None:
         steady = settled & (truth.wheel_velocity_mps > 0.2) & (truth.forward_velocity_mps > 0.3) & (radius_m > 1.5)
         steady_m = np.diff(truth.distance_m, prepend=0.0)[steady].sum()
         assert run.manifest.distance_by_reason_m["kept"] >= 0.90 * steady_m
-
-
-def test_patches_show_the_terrain_at_their_own_pixel_centres(demo: Demo) -> None:
-    world, dataset = find_scenario("demo").world, demo[0] / "dataset"
-    card = json.loads((dataset / "dataset.json").read_text())
-    to_map = pyproj.Transformer.from_crs("EPSG:4326", card["maps"][0]["crs"], always_xy=True)
-    offset = (np.arange(40) + 0.5) / 40
-    checked = wrong = 0
-    for split in package.open_dataset(dataset).values():
-        samples = split.samples
-        start, end = (
-            np.column_stack(to_map.transform(*(_column(samples, f"{end}_{axis}_deg") for axis in ("lon", "lat"))))
-            for end in ("start", "end")
-        )
-        for row in range(0, len(samples), 7):
-            along = end[row] - start[row]
-            left = np.array([-along[1], along[0]])
-            xy = start[row] + offset[None, :, None] * along + (0.5 - offset)[:, None, None] * left
-            ids = np.rint(split.patches[row, ..., 1] * (len(card["classes"]) - 1)).astype(int) + 1
-            truth = world.terrain_class(xy[..., 0], xy[..., 1])
-            wrong += int((ids != truth).sum())
-            checked += truth.size
-    assert checked > 50_000
-    assert wrong <= 0.005 * checked
 
 
 def test_no_dropped_row_inside_a_segment(drives: Drives) -> None:
