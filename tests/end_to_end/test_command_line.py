@@ -11,6 +11,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from stored_files import checksums, map_path, only_run, tables
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.simulation import Faults, SimulatedSite, make_tiny, simulate
+from tcpipe.simulation.scenarios import RasterSpec
 from tcpipe.stages.read import read_run
 from tcpipe.store import Store, open_store
 from tcpipe.tables.levels import Streams
@@ -36,10 +38,9 @@ _SECONDS = (32.0, 17.0, 17.0)
 def sites(tmp_path_factory: pytest.TempPathFactory) -> list[SimulatedSite]:
     """Three short drives over one small world; the first is long enough for some segments."""
     here = tmp_path_factory.mktemp("sites")
-    return [
-        simulate(here / str(seed), scenario=make_tiny(Faults(), seconds=seconds), seed=seed)
-        for seed, seconds in enumerate(_SECONDS)
-    ]
+    first, *others = (make_tiny(Faults(), seconds=seconds) for seconds in _SECONDS)
+    coarse = [replace(scenario, rasters=RasterSpec(1.0, 1.0, 1.0)) for scenario in others]
+    return [simulate(here / str(seed), scenario=each, seed=seed) for seed, each in enumerate((first, *coarse))]
 
 
 @pytest.fixture(scope="session")
@@ -260,12 +261,10 @@ def test_quiet_prints_no_line_for_an_unchanged_log(log: Path, store: Path, tmp_p
 
 
 def test_nobody_listening_is_no_reason_to_stop(logs: list[Path], tmp_path: Path) -> None:
-    """Standard error closed, or a pipe that nobody reads: the work is done all the same."""
-    for number, redirection in enumerate(("2>&-", "2>&1 | head -c1")):
-        subprocess.run(
-            ["bash", "-c", f"{COMMAND} ingest {logs[1]} --store s{number} {redirection}"], cwd=tmp_path, check=False
-        )
-        assert len(tables(tmp_path / f"s{number}")) == 1
+    """Standard error closed, a pipe that nobody reads: the work is done all the same."""
+    script = f"{COMMAND} ingest {logs[1]} --store store 2>&- | true"
+    subprocess.run(["bash", "-c", script], cwd=tmp_path, check=False)
+    assert len(tables(tmp_path / "store")) == 1
     full = subprocess.run(
         ["bash", "-c", f"{COMMAND} inspect {logs[1]} --json >/dev/full"], check=False, stderr=-1, text=True
     )
@@ -503,16 +502,3 @@ def test_a_worker_that_is_killed_costs_only_its_own_log(logs: list[Path], tmp_pa
     _run("ingest", logs[0], "--store", "alone", cwd=tmp_path)
     by_worker, alone = (checksums(tmp_path / name) for name in ("tcpipe-store", "alone"))
     assert {name: by_worker.get(name) for name in alone} == alone != {}, "a worker makes the same bytes"
-
-
-def test_two_at_once_on_one_store_do_not_harm_each_other(logs: list[Path], tmp_path: Path) -> None:
-    shutil.copy(logs[1], tmp_path / "copy.mcap")
-    batches = [[logs[1]], [tmp_path / "copy.mcap", logs[2]]]
-    running = [_start("ingest", *batch, cwd=tmp_path) for batch in batches]
-    for process in running:
-        _, told = process.communicate(timeout=HANGS_S)
-        assert process.returncode == 0, told
-    state = open_store(tmp_path / "tcpipe-store").scan()
-    assert (len(state.runs), len(state.facts["seen"])) == (2, 3)
-    assert not list(tmp_path.rglob(".tmp-*"))
-    assert "nothing to do: 3 of 3" in _run("ingest", *batches[0], *batches[1], cwd=tmp_path)

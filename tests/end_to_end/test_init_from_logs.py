@@ -166,6 +166,19 @@ def without_values(text):
     return re.sub(r"(?<=messages), [^;\n]*", "", text)
 
 
+def test_ingest_prints_the_lines_that_inspect_proposes_for_power(drive, tmp_path):
+    log = tmp_path / "run.mcap"
+    write_mcap(log, watts(drive))
+    lines = [line.strip() for line in run("ingest", log, "--store", tmp_path / "store").output.splitlines()]
+    assert any("/base/power_w" in line and line.endswith("[power-candidates]") for line in lines)
+    printed = [line for line in lines if line.startswith("[") or " = " in line]
+    proposed = run("inspect", log).output.partition("# Proposed by tcpipe")[2].partition("\n")[2].splitlines()
+    values = parse_toml(
+        "\n".join(line.removeprefix("# ") for line in proposed if line.startswith("[") or " = " in line)
+    )
+    assert parse_toml("\n".join(printed)) == {key: values[key] for key in ("read", "power_sources")}
+
+
 def test_a_recipe_settles_what_inspect_and_preflight_propose(drive, tmp_path):
     log, recipe = tmp_path / "run.mcap", tmp_path / "tcpipe.toml"
     write_mcap(log, unplaced(drive))

@@ -1,8 +1,8 @@
-"""Twenty drives with a fault each: following a printed line makes no label wrong and sure that was not before."""
+"""Drives with a fault each: following a printed line makes no label wrong and sure that was not before."""
 
 import numpy as np
 import pytest
-from faulty_drives import CODES, make_drives
+from faulty_drives import make_drives
 from suggested_recipes import recipe_that_follows
 
 from tcpipe.formats.logs.writing import write_mcap
@@ -15,9 +15,16 @@ MIN_COVERAGE = 0.8
 """Share of true labels inside 2σ below which a label is wrong."""
 
 
+FAULTS = (
+    "imu_late", "visual_late", "gyroscope_mirrored", "wheels_too_fast", "axes_swapped", "fixes_jump", "currents_in_milliamperes",
+    "power_slow",
+)  # fmt: skip
+"""Faults whose printed lines test_bad_sensors.py and test_power_sensor.py do not follow."""
+
+
 @pytest.fixture(scope="module")
 def drives():
-    return make_drives()
+    return make_drives(*FAULTS)
 
 
 def find_wrong_and_sure(drive, result, store):
@@ -38,7 +45,7 @@ def find_wrong_and_sure(drive, result, store):
     return found
 
 
-@pytest.mark.parametrize("name", CODES)
+@pytest.mark.parametrize("name", FAULTS)
 def test_followed_lines_make_no_label_wrong_and_sure(drives, tmp_path, name):
     log, drive = tmp_path / "drive.mcap", drives[name]
     write_mcap(log, drive.messages)
