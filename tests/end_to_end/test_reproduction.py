@@ -1,18 +1,21 @@
 """Train, evaluate and reproduce through the installed command, from a simulated site to the claims."""
 
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
+from dataclasses import replace
+from unittest.mock import patch
 
 import pytest
-from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe
+from installed_command import plain_lines, tcpipe
+
+from tcpipe.simulation import find_scenario, scenarios
 
 pytest.importorskip("torch")
 
 ENV = {"OMP_NUM_THREADS": "1"}
+LENGTH_M = 130.0
+"""Length of the three drives [m]; `tcpipe reproduce --quick` drives 190 m."""
 
 OWN = """
 import numpy as np
@@ -22,12 +25,19 @@ def predict(patches, features):
 """
 
 
+def make_short_drives():
+    spec = find_scenario("paper_quick")
+    drives = tuple(replace(drive, plan=replace(drive.plan, length_m=LENGTH_M)) for drive in spec.drives)
+    return replace(spec, drives=drives)
+
+
 @pytest.fixture(scope="module")
 def reproduced(tmp_path_factory):
-    here = tmp_path_factory.mktemp("reproduced")
-    done = tcpipe("reproduce", "here", "--quick", cwd=here, env=ENV)
-    assert done.returncode == 0, done.stderr
-    return here, done
+    here, short = tmp_path_factory.mktemp("reproduced"), make_short_drives()
+    with patch.dict(scenarios.SCENARIOS, paper_quick=lambda: short):
+        done = tcpipe("reproduce", "here", "--quick", cwd=here, env=ENV)
+        assert done.returncode == 0, done.stderr
+        yield here, done
 
 
 def test_every_claim_is_printed_as_it_stands(reproduced):
@@ -118,25 +128,6 @@ def test_train_and_evaluate_by_hand(reproduced):
     assert set(json.loads(done.stdout)["splits"]) == {"test", "unseen"}
 
 
-def test_an_interrupted_training_ends_as_one_that_is_not(reproduced, tmp_path):
-    """Ctrl-C after the first epoch, then the same command again: the model is the same, byte for byte."""
-    here, _ = reproduced
-    options = ("train", here / "here" / "dataset", "--width", "16", "--epochs", "2", "--batch-size", "16")
-    with subprocess.Popen(
-        [COMMAND, *options, "stopped"], cwd=tmp_path, env={**os.environ, **ENV}, stderr=subprocess.PIPE, text=True
-    ) as running:
-        assert next(line for line in running.stderr if "epoch 1 of" in line)
-        running.send_signal(signal.SIGINT)
-        told = running.communicate(timeout=HANGS_S)[1]
-    assert running.returncode == 130, told
-    assert "no output is incomplete" in told
-    assert [re.sub("[0-9a-f]{8}", "KEY", path.name) for path in tmp_path.iterdir()] == ["stopped.KEY.checkpoint"]
-    resumed, whole = (tcpipe(*options, name, cwd=tmp_path, env=ENV) for name in ("stopped", "whole"))
-    assert "stopped: resumes after epoch" in resumed.stderr
-    assert whole.returncode == 0
-    assert {path.name: path.read_bytes() for path in (tmp_path / "stopped").iterdir()} == {
-        path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()
-    }
 
 
 def test_bad_input_is_one_plain_line(reproduced):
