@@ -154,7 +154,7 @@ def test_a_right_sensor_gives_no_finding_and_only_its_prior(drive):
 
 def test_labels_of_many_sensors_are_as_wrong_as_they_say(drive):
     """Gain and zero of each run are quantiles of their priors: pooled over runs, σ is right."""
-    rng, quantiles = np.random.default_rng(5), norm.ppf((np.arange(10) + 0.5) / 10)
+    rng, quantiles = np.random.default_rng(5), norm.ppf((np.arange(20) + 0.5) / 20)
     drawn = [partial(lambda amp, _, gain, zero: amp * (1.0 + gain) + zero, gain=gain, zero=zero)
              for gain, zero in zip(0.02 * rng.permutation(quantiles), 0.2 * rng.permutation(quantiles), strict=True)]  # fmt: skip
     runs = [label(drive, change) for change in drawn]

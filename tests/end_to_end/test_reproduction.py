@@ -128,8 +128,6 @@ def test_train_and_evaluate_by_hand(reproduced):
     assert set(json.loads(done.stdout)["splits"]) == {"test", "unseen"}
 
 
-
-
 def test_bad_input_is_one_plain_line(reproduced):
     here, _ = reproduced
     assert "there is no such directory" in plain_lines(tcpipe("train", "nowhere", cwd=here, env=ENV), 2)

@@ -26,7 +26,9 @@ def place(tmp_path_factory) -> Path:
     """A directory with stores of one log: ``with`` and ``power`` (without power) have the map, ``map`` has none."""
     here = tmp_path_factory.mktemp("archive")
     spec = find_scenario("paper_quick")
-    site = simulate(here / "site", scenario=replace(spec, drives=spec.drives[:1]))
+    (drive, *_) = spec.drives
+    drive = replace(drive, plan=replace(drive.plan, length_m=130.0))
+    site = simulate(here / "site", scenario=replace(spec, drives=(drive,)))
     (here / "power.toml").write_text(NO_POWER)
     (here / "gnss.toml").write_text(NO_GNSS)
     layers = [word for name, path in site.rasters.items() for word in (f"--{name}", path)]
