@@ -139,7 +139,7 @@ class Drive:
         return LAT_DEG + north / _NORTH_M_PER_DEG, LON_DEG + east / _EAST_M_PER_DEG
 
     def velocity(self, row: int) -> tuple[float, float]:
-        """Return the velocity of the antenna east and north [m/s], as a receiver tells it."""
+        """Return the velocity of the antenna east and north [m/s], as a receiver measures it."""
         cos, sin, turn = np.cos(self.yaw[row]), np.sin(self.yaw[row]), self.turn[row]
         ahead, aside = self.speed[row] + turn * ANTENNA_FRD[1], turn * ANTENNA_FRD[0]
         east, north = cos * ahead - sin * aside, sin * ahead + cos * aside

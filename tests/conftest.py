@@ -33,7 +33,7 @@ def dataset_page(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of the random order (pytest-randomly), the files that take longest come first: two workers end at about the same time."""
+    """Put the slowest files of the random order (pytest-randomly) first: two workers end at about the same time."""
     items.sort(key=lambda item: "end_to_end" not in item.path.parts)
 
 

@@ -94,7 +94,7 @@ def _run_here(command: list[str], cwd: Path, env: Mapping[str, str], out: int, e
 
 @contextmanager
 def _standard_files(out: int, err: int) -> Iterator[None]:
-    """Let what is printed, by Python or by a library beneath it, go to these files; their streams begin anew."""
+    """Redirect all output, of Python and of the libraries below it, to these files, with new streams."""
     kept = {number: os.dup(number) for number in (1, 2)}
     os.dup2(out, 1)
     os.dup2(err, 2)

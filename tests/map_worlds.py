@@ -1,4 +1,4 @@
-"""Analytic worlds for map tests: closed-form height, grey and class, written as GeoTIFFs, and segments that lie in them."""
+"""Analytic worlds for map tests: closed-form height, grey and class, written as GeoTIFFs, and segments inside them."""
 
 from collections.abc import Sequence
 from contextlib import contextmanager

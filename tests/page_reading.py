@@ -9,7 +9,7 @@ import numpy as np
 
 
 def data_of(html):
-    """What the page tells its script."""
+    """Return the data that the page holds for its script."""
     return json.loads(re.search(r'<script type="application/json" id="page-data">(.*?)</script>', html)[1])
 
 

@@ -15,7 +15,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 from xml.sax.saxutils import escape, unescape
 
 FORBIDDEN, SKEWED = "forbidden", "skewed"
-"""The bucket that nobody may read, and one that says that the clock is wrong."""
+"""Bucket without read access, and bucket that answers that the clock is wrong."""
 _DENIALS = {FORBIDDEN: "AccessDenied", SKEWED: "RequestTimeTooSkewed"}
 
 READ_ONLY = "read-only"

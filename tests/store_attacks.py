@@ -71,7 +71,7 @@ class World:
         self.actor: Actor | None = None
         self.baton = threading.Semaphore(0)
         self.requests, self.writes, self.namings = 0, list[int](), list[int]()
-        """Of the call: how many it has made, which of them wrote, and which wrote a document that names payload."""
+        """Requests of the call: their number, those that wrote, and those that wrote a document that names payload."""
 
     # ---- requests
 
@@ -91,7 +91,7 @@ class World:
             self.left -= 1
 
     def patch(self, monkeypatch: pytest.MonkeyPatch, *, is_light: bool = True) -> None:
-        """Let each request to the store, on disk or in a bucket in memory, begin with a `step`."""
+        """Begin each request to the store, on disk or in a bucket in memory, with a `step`."""
         do, put_files = Place._do, Place.put_files
 
         def do_stepwise(self_: Place, name: str, *args: object, **how: object) -> object:
@@ -123,7 +123,7 @@ class World:
         return Process("here", "m", "b", "n", self.actor.pid if self.actor else self.pid, "1")
 
     def run(self, act: Callable[[], object], *, kill_at: int | None = None) -> bool:
-        """Let a call run in a process of its own; return whether it was killed, before its request ``kill_at``."""
+        """Run a call as a process of its own; return whether it was killed, before its request ``kill_at``."""
         documents._DECODED.clear()  # as another process: the number of requests depends on it
         self.pid = next(_PIDS)
         self.alive, self.left = {self.pid}, kill_at
@@ -137,7 +137,7 @@ class World:
         return False
 
     def interleave(self, acts: list[Callable[[], object]], turns: list[tuple[int, int]]) -> list[BaseException | None]:
-        """Let calls run side by side: by ``turns`` (call, requests), then each to its end. Return their errors."""
+        """Run calls side by side: by ``turns`` (call, requests), then each to its end. Return their errors."""
         documents._DECODED.clear()
         actors = [Actor(self, act, next(_PIDS)) for act in acts]
         self.alive = {actor.pid for actor in actors}
@@ -204,7 +204,7 @@ class World:
         return {name: bytes(obstore.get(self.memory, name).bytes()) for name in names}
 
     def restore(self, files: dict[str, bytes]) -> None:
-        """Let the store have these files and no others."""
+        """Replace all files of the store by these."""
         if isinstance(self.root, Path):
             shutil.rmtree(self.root, ignore_errors=True)
             for name, data in files.items():

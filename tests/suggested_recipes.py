@@ -1,4 +1,4 @@
-"""What findings propose for the recipe, followed as a person would."""
+"""Recipes that follow the proposals of findings, as a person would."""
 
 import tomllib
 from collections.abc import Mapping

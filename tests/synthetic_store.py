@@ -237,7 +237,7 @@ def change_run(store, run_id, **values):
 
 
 def supersede(store, run_id, by):
-    """Let the run ``by`` be a longer recording of what another run has the beginning of."""
+    """Make the run ``by`` a longer recording that begins as another run does."""
     for number, name in enumerate((run_id, by), 1):
         change_run(store, name, recording=Recording(first_ns=0, last_ns=number, rows=number, beginning=by))
 

@@ -1,4 +1,4 @@
-"""What docs/explanation/same-bytes.md says of another processor: the same site, runs and samples, but for the last digits."""
+"""Another processor makes the same site, runs and samples, but for the last digits (docs/explanation/same-bytes.md)."""
 
 import os
 import subprocess
@@ -20,9 +20,9 @@ from stored_files import tables
 import tcpipe
 
 NEAR = 1e-9
+"""Largest difference, relative to the largest value of a column; the page says 1e-12, other processors may need more."""
 NEAR_DIFFERENCE = 1e-7
-"""Of a standard deviation whose variance is a small difference of large ones."""
-"""Of the largest value of a column; the page says 1e-12, this leaves room for processors that were not seen."""
+"""The same of a standard deviation whose variance is a small difference of large ones."""
 
 
 @pytest.fixture(scope="module")

@@ -145,7 +145,7 @@ def test_an_imu_too_slow_to_integrate_changes_nothing(drive, tmp_path):
 
 @pytest.mark.parametrize(("recipe", "period_s"), [(Recipe(), 0.01), (UKF, 0.08)])
 def test_gaps_of_an_imu_are_driven_as_without_it(drive, tmp_path, recipe, period_s):
-    """What it felt last is not held for seconds: the forward filter made 272 m of 63."""
+    """The last measurement is not held for seconds: the forward filter made 272 m of 63."""
     gaps = ((15.0, 18.0), (25.0, 30.0), (37.0, 47.0))
 
     def when(at_s):
@@ -327,7 +327,7 @@ def test_a_sensor_that_is_unlike_the_rest_is_refused(drive, tmp_path, what):
 
 
 def test_two_that_contradict_each_other_are_both_refused(drive, tmp_path):
-    """Without camera, IMU and command nothing tells whether fixes or wheels are right: no label is better than a wrong one."""
+    """Without camera, IMU and command, no sensor decides between fixes and wheels: no label is better than a wrong one."""
     alone = drive.without("visual", "imu", "command")
     other = alone.changed("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]})
     with pytest.raises(FusionError) as error:

@@ -261,7 +261,7 @@ def test_quiet_prints_no_line_for_an_unchanged_log(log: Path, store: Path, tmp_p
 
 
 def test_nobody_listening_is_no_reason_to_stop(logs: list[Path], tmp_path: Path) -> None:
-    """Standard error closed, or a pipe that nobody reads: the work is done all the same."""
+    """The work is complete with standard error closed, and with an unread pipe."""
     closed = f"{COMMAND} ingest {logs[1]} --store closed 2>&-"
     subprocess.run(["bash", "-c", closed], cwd=tmp_path, check=False, stdout=subprocess.DEVNULL)
     run_script(f"tcpipe ingest {logs[1]} --store unread 2>&1 | head -c1", cwd=tmp_path, env=dict(os.environ))

@@ -43,7 +43,7 @@ def work(tmp_path_factory):
 
 
 def harmless(done, *codes):
-    """Nothing that a terminal obeys, in text or in JSON."""
+    """Assert that the output holds no character that a terminal obeys; return it."""
     assert done.returncode in codes, done.stderr
     assert "Traceback" not in done.stderr
     for text in (done.stdout, done.stderr):

@@ -1,4 +1,4 @@
-"""A robot that nobody knows: ``init --from`` its log, at most two lines edited, and ``ingest`` gives labels with energy.
+"""A robot without a profile: ``init --from`` its log, at most two lines edited, and ``ingest`` gives labels with energy.
 
 Six robots, of one simulated drive each; their energies are compared with the truth.
 """

@@ -216,7 +216,7 @@ PAPER = "ortho,terrain,height"
 
 @pytest.fixture(scope="module")
 def models(datasets):
-    """Models of the paper's layers, with those of the place, on which the velocity depends, and with layers that tell little of it."""
+    """Models of the paper's layers alone, with layers that show the place, and with layers that hardly show it."""
     for name, layers in (
         ("plain", PAPER),
         ("placed", f"{PAPER},east,north"),

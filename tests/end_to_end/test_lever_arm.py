@@ -1,4 +1,4 @@
-"""What is claimed of positions where the lever arm is stated as usual, declared exact, or declared exact and wrong."""
+"""Standard deviations of positions with a lever arm that is stated, or declared exact."""
 
 import numpy as np
 import pytest

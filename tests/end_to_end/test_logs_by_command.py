@@ -138,7 +138,7 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
 
 
 def test_each_log_is_told_as_it_ends(tmp_path):
-    """The second log cannot end before the first has been told."""
+    """The second log waits until the line of the first was read."""
     drive_at(tmp_path / "a.mcap")
     stuck = "import tcpipe.stages.mask as mask, time, os\nfirst = mask.mask_track\n"
     stuck += "def waiting(track, *a, **k):\n    while 'b-' in track.info.run_id and not os.path.exists('go'): time.sleep(0.02)\n"
@@ -252,7 +252,7 @@ def test_export_says_what_it_did_and_that_nothing_is_left_to_do(tmp_path):
 
 
 def test_fixes_of_no_ground_robot_make_no_run_and_no_promise(tmp_path):
-    """RTK of up to 30 m/s with power: labels of nobody's drive, until the recipe or the robot says that it is so fast."""
+    """RTK of up to 30 m/s with power gives no labels, unless the recipe or the robot allows the speed."""
     at_s = np.arange(0.0, 120.0, 0.1)
     way_m = np.cumsum(0.1 * np.minimum(0.5 * at_s, 30.0))
     rows = "".join(

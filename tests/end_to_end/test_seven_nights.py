@@ -88,7 +88,7 @@ def data(tmp_path: Path) -> Iterator[Path]:
 
 @contextmanager
 def full_disk(data: Path) -> Iterator[str]:
-    """Fill the disk but for a few documents; yield what a job has to begin with where only a limit on the size of files can stand in."""
+    """Fill the disk but for a few documents; without a disk of its own, yield a limit on file size for the job."""
     if not data.is_mount():
         yield "ulimit -f 16; "
         return

@@ -1,4 +1,4 @@
-"""What an ingest, and a build with nothing to do, load: nothing heavy that they do not use, and nothing twice."""
+"""An ingest, and a build with nothing to do, import no heavy module that they do not use."""
 
 import subprocess
 import sys

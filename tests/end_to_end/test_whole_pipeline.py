@@ -37,7 +37,7 @@ def _run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
-    """What ``tcpipe demo`` made: two drives over a small site, all sensor faults on, their store and dataset; tests read it only."""
+    """Output of ``tcpipe demo``: two drives over a small site with all sensor faults, their store and dataset; read only."""
     here = tmp_path_factory.mktemp("demo")
     return here / "here", _run("demo", "here", cwd=here)
 

@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing of what reads logs: whatever the bytes, the reader refuses or sets aside by name, and never tells two stories.
+"""Coverage-guided fuzzing of the log readers: they read any bytes, or refuse them by name, and read the same twice.
 
 By hand: ``python tests/fuzz/fuzz_log_reading.py TARGET [--seconds 600] [--corpus DIR]``; TARGET is ``containers`` (the record walks of
 .mcap and .bag, the pages of .db3), ``autopilots`` (.ulg and ArduPilot's .bin), ``plans`` (decoding plans, against rosbags' row by row)
@@ -49,7 +49,7 @@ TYPES = (
 )
 _MOST_BYTES = 1 << 16
 _ALIKE = 8
-"""So many valid messages go before the fuzzed ones: enough for a layout, which those that are as long may or may not share."""
+"""Number of valid messages before the fuzzed ones: enough to learn a layout."""
 
 
 @dataclass(frozen=True)

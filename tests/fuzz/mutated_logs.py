@@ -1,4 +1,4 @@
-"""Small logs of every container, changed where their structure is, and the oracle: nothing is lost or changed that is not said.
+"""Small logs of every container with a changed structure, and an oracle: each loss and change is reported.
 
 By hand: ``python tests/fuzz/mutated_logs.py [--count 10000] [--seed 1] [--keep DIR]``. Each mutation changes one to three places of a
 log (lengths, op codes, ids, stamps, CRCs, indexes; SQLite's page heads, cell pointers, varints, serial types, chains; or any bytes), or
@@ -54,7 +54,7 @@ class Clean:
     data: bytes
     rows: Rows
     own: tuple[frozenset[Row], ...]
-    """Of each byte, the messages whose own it is."""
+    """Messages that own each byte."""
     compressed: tuple[tuple[int, int], ...]
     """Ranges of compressed data that no checksum covers."""
     places: tuple[tuple[int, int], ...]
@@ -64,7 +64,7 @@ class Clean:
 
 @dataclass(frozen=True)
 class Finding:
-    """What became of one mutated log."""
+    """Outcome of one mutated log."""
 
     kind: str
     verdict: str
@@ -116,7 +116,7 @@ def clean_logs(directory: Path) -> list[Clean]:
 
 
 def _messages(store: object, *, long: bool = False) -> list[Message]:
-    """Some messages of two topics whose payloads are found nowhere else in a log."""
+    """Return messages of two topics with payloads that occur once in a log."""
     rng = np.random.default_rng(5)
     serialize = ROS1.serialize_ros1 if store is ROS1 else ROS2.serialize_cdr
     color, text = "std_msgs/msg/ColorRGBA", "std_msgs/msg/String"
@@ -159,7 +159,7 @@ def _clean(
 
 
 def _own_values(own: list[set[Row]], kind: str, data: bytes, row: Row, payload: bytes) -> None:
-    """Note where a message's payload lies, and those of its times and ids that stand there once only."""
+    """Record the bytes of a message's payload, and of its times and ids that occur once."""
     step = 1 if len(payload) > 100 else _PIECE  # long ones lie on several pages
     for start in range(0, len(payload) - _PIECE + 1, step):
         _own(own, data, payload[start : start + _PIECE], {row})

@@ -15,7 +15,7 @@ WRITERS = {"ulog": write_ulog, "dataflash": write_dataflash}
 
 
 def read(path, kind):
-    """Return every message of a log with how often it is there, and whether a loss is told."""
+    """Return the count of every message of a log, and whether a loss is reported."""
     records = read_records(path, kind)
     rows = Counter()
     for name, of in records.messages.items():

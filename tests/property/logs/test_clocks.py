@@ -1,4 +1,4 @@
-"""Whatever the stamps: rows are ordered, told apart, and accounted for."""
+"""With any stamps: rows are ordered, distinct, and accounted for."""
 
 import itertools
 

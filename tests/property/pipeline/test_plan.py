@@ -1,4 +1,4 @@
-"""What status predicts is what ingest does, whatever happened before: one plan, executed or shown."""
+"""Status predicts what ingest does, after any history: one plan, executed or shown."""
 
 import hashlib
 import os
@@ -42,7 +42,7 @@ def row(tmp_path_factory) -> Run:
 
 
 def make_row(row, task, sha256, kind):
-    """What ingesting a log of this kind would write."""
+    """Return the documents that an ingest of a log of this kind writes."""
     log = LogOrigin(task.source.origins, sha256)
     key, name = ingest_key(task.recipe), f"{task.source.stem}-{sha256[:8]}"
     asked = {"robot_requested": task.robot, "message_definitions": task.definitions, "ingest_key": key}

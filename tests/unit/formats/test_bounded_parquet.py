@@ -26,7 +26,7 @@ ROWS = 40_000_000
 
 
 def texts(rows):
-    """One long text, which lies in the file once."""
+    """Return rows of one long text that the file holds once."""
     text = pa.array(["x" * 500_000])
     return pa.table({"s": pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), text)})
 

@@ -1,4 +1,4 @@
-"""What a Parquet file says of its geometry."""
+"""Geometry metadata of a Parquet file."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Rows of tables and arrays that lie in files."""
+"""Rows of tables and arrays in mapped files."""
 
 import numpy as np
 import pyarrow as pa
@@ -9,7 +9,7 @@ from tcpipe.formats.parquet import map_table, move_rows_to_file, take_rows, writ
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
-    """Of five pieces, one of them empty."""
+    """Return a table of five pieces, one of them empty."""
     path = tmp_path_factory.mktemp("mapped") / "rows.arrow"
     names = [f"segment {number}" for number in range(60)]
     whole = pa.table({"name": names, "value": pa.array([None, *range(59)], pa.int64())})

@@ -99,7 +99,7 @@ def _finish(logs):
 
 @pytest.mark.parametrize("verb", ["put_files", "put"])
 def test_a_failed_upload_costs_its_own_log(served, logs, monkeypatch, verb):
-    """Of payload, or of the document that names it: the store is busy for the first name of its kind."""
+    """The store is busy for the first payload, or for the first document that names one."""
     monkeypatch.setenv("TCPIPE_RETRY_MINUTES", "0.01")
     write, folder = getattr(Place, verb), {"put_files": "blobs/", "put": "runs/"}[verb]
 

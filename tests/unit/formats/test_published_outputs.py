@@ -1,4 +1,4 @@
-"""Outputs at a URL: a build is seen whole or not at all, two writers are never mixed, and a killed one blocks nobody."""
+"""Outputs at a URL: a build is seen whole or not at all, two writers are never mixed, and a killed writer blocks no other."""
 
 import hashlib
 import json
@@ -47,7 +47,7 @@ def write(place, text, card=CARD):
 
 
 def seen(place):
-    """What a reader finds: the text of the card, and of the file beside it."""
+    """Return the text of the card, and of its file, as a reader finds them."""
     found = find_newest(place.root, [CARD])
     return found and (json.loads(found.data)["text"], (found.place.read("data") or b"").decode())
 

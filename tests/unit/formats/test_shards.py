@@ -31,7 +31,7 @@ def array(directory, dtype, *, compression="zstd", shape=(70, 9, 8), fill_value=
 
 
 def form(theirs):
-    """What a card would say of an array."""
+    """Return the facts of an array that a card holds."""
     return {
         "shape": theirs.shape,
         "chunk_shape": theirs.chunks,
@@ -156,7 +156,7 @@ def crc(data):
     ],
 )
 def test_a_sealed_shard_that_claims_too_much_or_too_little_is_damage(tmp_path, codec, length, place, wanted):
-    """Memory that nobody wrote to was read as pixels where a chunk held less."""
+    """Unwritten memory was read as pixels where a chunk held less."""
     group = create_group(tmp_path / "a.zarr")
     theirs = add_array(
         group, "x", shape=(32, 9, 8), dtype=np.uint8, chunks=(8, 9, 8), shards=(32, 9, 8), dimensions=("a", "b", "c"),

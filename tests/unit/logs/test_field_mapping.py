@@ -1,4 +1,4 @@
-"""Stamps told by their size, units, GPS time, and fields of messages of one's own."""
+"""Units of stamps by their size, GPS time, and fields of custom messages."""
 
 import numpy as np
 import pytest

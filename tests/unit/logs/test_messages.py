@@ -1,4 +1,4 @@
-"""What messages mean, row by row."""
+"""Values of messages, row by row."""
 
 import numpy as np
 import pytest
@@ -76,7 +76,7 @@ def test_a_covariance_that_says_nothing_is_null() -> None:
 
 @pytest.mark.parametrize("count", [3, 200])
 def test_a_fix_without_altitude_is_a_fix(count: int) -> None:
-    """NavSatFix says it with NaN; a receiver in two dimensions repeats one height for ever."""
+    """NavSatFix has NaN then; a receiver in two dimensions repeats one height."""
     columns = {name: np.resize(values, (count, *values.shape[1:])) for name, values in nav_sat_fix().items()}
     columns["altitude"] = 400.0 + np.zeros(count)
     columns["altitude"][1] = np.nan

@@ -59,7 +59,7 @@ def logs(drives, tmp_path):
 
 
 def kill(logs, store, monkeypatch, **how):
-    """Let an ingest end as if it were killed, by what no handler of errors sees, and its process be gone."""
+    """End an ingest as a kill does, past all error handlers, with a process that is gone."""
 
     def died(*_, **__):
         raise SystemExit

@@ -76,7 +76,7 @@ def lose(part: Path) -> Callable[[], None]:
 
 
 def list_problems(root, out):
-    """What a dry run of build-dataset and status say about runs."""
+    """Return the problems of runs in a dry run of build-dataset, and in status."""
     result = build_dataset(out, store=root, recipe=Recipe(), dry_run=True)
     build = [
         (of.code, of.subject.name)

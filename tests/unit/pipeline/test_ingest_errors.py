@@ -1,4 +1,4 @@
-"""What fails in an ingest is named: the output, or the log."""
+"""Errors of an ingest name the output, or the log."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""What preflight says of topics, rates and losses: by hand. That it promises what ingesting gives, tests/end_to_end shows."""
+"""Topics, rates and losses of preflight, by hand; tests/end_to_end compares its promise with an ingest."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What goes from a store and what stays: nothing of a dataset, nothing of somebody else, nothing while another call runs."""
+"""Prune removes old results; it keeps files of datasets and of users, and waits for running calls."""
 
 from dataclasses import replace
 
@@ -178,7 +178,7 @@ def test_files_of_others_stay(store):
 
 @pytest.fixture
 def elsewhere(monkeypatch):
-    """Let calls be those of a process on another machine."""
+    """Make all calls those of a process on another machine."""
     with monkeypatch.context() as patch:
         patch.setattr(calls, "identify_process", lambda: replace(identify_process(), host="node7"))
         yield

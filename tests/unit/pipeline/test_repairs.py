@@ -1,4 +1,4 @@
-"""What `verify` says is to be done about damage: done, everything is as it was written."""
+"""The repairs that `verify` prints restore a damaged store."""
 
 import shutil
 

@@ -169,7 +169,7 @@ def test_no_test_is_no_problem_where_none_is_wanted(store, tmp_path):
 
 
 def test_streams_that_are_not_as_they_were_written_are_made_again(store):
-    """A lever arm stands in a footer that no page's checksum covers."""
+    """A lever arm is in the footer, which no page's checksum covers."""
     sensor = Sensor("/fix", "sensor_msgs/msg/NavSatFix", "gps", "the only one", (0.1, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0))
     streams = Streams({"gnss": STREAMS["gnss"].empty()}, {"gnss": sensor}, "husky")
     add_run(store, "e", segments("e", *lanes(14.0, -10.0, 10.0)), streams=streams)

@@ -1,4 +1,4 @@
-"""List the state and problems of every log: each state once, told by what ingest did, and the same after it."""
+"""Status lists the state and problems of every log: each state once, as ingest left it."""
 
 import os
 import shutil

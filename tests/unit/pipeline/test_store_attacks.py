@@ -16,7 +16,7 @@ DRAWS_DATASET_PAGES = True  # no dataset is built here
 
 IS_WHOLE = bool(os.environ.get("TCPIPE_TEST_OPERATIONS"))
 SPARSE = 4
-"""Of so many requests that write one is chosen in `make test`; those that write a document that names payload are, too."""
+"""`make test` chooses every fourth request that writes, and those that write a document that names payload."""
 
 
 @pytest.fixture(scope="module")

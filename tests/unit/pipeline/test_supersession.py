@@ -1,4 +1,4 @@
-"""Of runs of one robot that begin with the same measurements the longest counts: found at each scan, and written nowhere."""
+"""The longest run counts of those of one robot that begin with the same measurements: each scan finds it."""
 
 import shutil
 

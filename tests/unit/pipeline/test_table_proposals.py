@@ -1,4 +1,4 @@
-"""What the tables of a folder propose: names and values decide together, and what they leave open is a comment."""
+"""Recipe proposed for a folder of tables: names and values decide together; open questions are comments."""
 
 import numpy as np
 import polars as pl

@@ -1,4 +1,4 @@
-"""What a withheld sensor shows of a track: errors that a test puts into the track are found, and their size is held against its σ."""
+"""A withheld sensor shows errors that a test adds to the track, and compares their size with its σ."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Messages that repeat readings are told from a slow or coarse signal that was measured for every message."""
+"""Repeated readings are distinguished from a slow or coarse signal that was measured for every message."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def wandering(count, rows, rng):
 
 
 def repeated(reading_hz, *, step, jitter=0.0, seed=1):
-    """Return what messages at 20 Hz tell of a device that is read so often, and the rows on which a reading arrives."""
+    """Return the estimate from messages at 20 Hz of a device with another rate, and the rows of its readings."""
     rng = np.random.default_rng(seed)
     period_s = 1.0 / reading_hz
     read_s = np.arange(0.37 * period_s, COUNT / 20, period_s)

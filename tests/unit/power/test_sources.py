@@ -135,7 +135,7 @@ TRUE_JOULE = np.cumsum(np.random.default_rng(4).uniform(0.5, 9.0, N))
 
 
 def spent(counter, row) -> float:
-    """What the rail of a counter says was spent between the second and the last of the rows that came."""
+    """Return the energy of a counter's rail between the second and the last row."""
     amp = counter.mean_amp(STAMP_NS[row], VOLT[row])
     made = make_rail("drive", make_samples(STAMP_NS[row], VOLT[row]), make_samples(STAMP_NS[row], amp), averaged=True)
     return float(integrate_energy([made], STAMP_NS[[1]], STAMP_NS[[N - 1]], rule="averaged")[0])

@@ -1,4 +1,4 @@
-"""What the gate drops of drives written down by formula, and what it must keep."""
+"""Rows that the mask drops and keeps, of drives given by formula."""
 
 from dataclasses import replace
 

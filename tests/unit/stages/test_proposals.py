@@ -1,4 +1,4 @@
-"""What messages of somebody's own could be used as: told by names and values, and by nothing that is of another role."""
+"""Roles proposed for custom messages, by names and values."""
 
 from dataclasses import replace
 

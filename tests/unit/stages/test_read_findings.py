@@ -1,4 +1,4 @@
-"""What reading says of topics, by hand."""
+"""Findings of reading about topics, by hand."""
 
 import numpy as np
 import pytest

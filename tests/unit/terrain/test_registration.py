@@ -1,4 +1,4 @@
-"""Whether a map lies where it was driven: shifts put in are found, and none is found where the ground cannot tell."""
+"""Shifts of a map against the driven heights: simulated shifts are found, and none on flat ground."""
 
 import numpy as np
 import pytest
@@ -171,7 +171,7 @@ def test_feet_are_told_on_a_tilted_map_and_a_tilt_is_no_scale(slope):
 
 
 def test_trees_and_even_ground_say_nothing_of_the_unit():
-    """A surface model with a metre of canopy on rolling ground explains little; even ground tells nothing at all."""
+    """A surface model with a metre of canopy on rolling ground explains little, even ground nothing."""
     xy = drive()
     height = 600.0 + rolling(*xy.T) + drift(len(xy), 0.03, 100, 2)
     trees = register_track(site(noise_m=1.0), xy, height).scale

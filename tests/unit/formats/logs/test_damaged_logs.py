@@ -235,7 +235,7 @@ WRONG_VALUES = ("NULL", "'text'", "x'00'", "2.5", "NULL, topic_id = 'x'", "NULL,
 )
 @pytest.mark.parametrize("journal", [False, True])
 def test_every_row_of_a_db3_is_a_message_or_counted_as_lost(tmp_path, column, value, journal):
-    """However a row is wrong, and whether a journal lies beside the file: what is read and what is lost is what was there."""
+    """Rows read and rows lost add up to the rows written, for any wrong value, with and without a journal."""
     path = tmp_path / "a.db3"
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")

@@ -28,7 +28,7 @@ from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import find_logs, open_log
 
 UNPRIVILEGED = [] if os.geteuid() else ["setpriv", "--bounding-set=-dac_override,-dac_read_search"]
-"""What goes before a command that shall not read everything, though it is root's."""
+"""Prefix of a command that takes root's right to read every file."""
 MCAP_OPTIONS = {
     "zstd": {},
     "lz4": {"compression": CompressionType.LZ4},

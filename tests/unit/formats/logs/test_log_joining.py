@@ -1,4 +1,4 @@
-"""Parts of a split ROS 1 recording: what stands in the first part only."""
+"""Parts of a split ROS 1 recording: messages of the first part alone."""
 
 import shutil
 

@@ -1,4 +1,4 @@
-"""Rasters whose CRS states its own datum shift (TOWGS84, bound CRS) lie where GDAL places them."""
+"""Rasters whose CRS states its own datum shift (TOWGS84, bound CRS) are placed as GDAL places them."""
 
 import numpy as np
 import pytest

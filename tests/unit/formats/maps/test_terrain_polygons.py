@@ -123,7 +123,7 @@ def test_every_feature_without_a_class_of_the_table_is_named(tmp_path, height):
 
 
 def test_drawings_that_cannot_be_placed_are_refused_in_one_line(tmp_path, height):
-    """Of what the reader of polygons refuses (test_geojson.py) one case."""
+    """One case that the reader of polygons refuses; the others: test_geojson.py."""
     far = [[[10.0, 50.0], [10.1, 50.0], [10.1, 50.1], [10.0, 50.0]]]
     north = [[[10.0, 95.0], [10.1, 95.0], [10.1, 95.1], [10.0, 95.0]]]
     for drawing, wanted in ((far, r"they are around 10.05.*the map covers 15.7"), (north, "axes look swapped")):

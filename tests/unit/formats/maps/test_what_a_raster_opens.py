@@ -1,4 +1,4 @@
-"""What GDAL would open for a user's raster: nothing but what lies beside it."""
+"""GDAL opens no file for a user's raster but those of its folder."""
 
 import shlex
 import socket
@@ -23,7 +23,7 @@ VRT = (
 
 @pytest.fixture
 def folders(tmp_path):
-    """A folder with a raster, and a raster elsewhere that nobody may see."""
+    """A folder with a raster, and a secret raster elsewhere."""
     site, secret = tmp_path / "site", tmp_path / "secret.tif"
     site.mkdir()
     for path in (site / "h.tif", secret):
@@ -33,7 +33,7 @@ def folders(tmp_path):
 
 @pytest.fixture
 def address():
-    """An address, and that nobody has called there."""
+    """Yield the address of a server; assert that it got no request."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         yield f"http://127.0.0.1:{server.getsockname()[1]}/x.tif"
         server.settimeout(0)

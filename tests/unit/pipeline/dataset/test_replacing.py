@@ -52,7 +52,7 @@ def here(made, tmp_path):
 
 
 def refused(here: Path, **how: object) -> tuple[str, ...]:
-    """What differs, after a build and a dry run that left the dataset as it was."""
+    """Return the differences that a build and a dry run name; both leave the dataset unchanged."""
     before, problems = tree(here / "dataset"), []
     for dry_run in (False, True):
         with pytest.raises(UsageError) as caught:
