@@ -239,7 +239,7 @@ class World:
             ("run", row.run_id, row.recipe_id) for row in state.runs.values() if row.blob and state.has_payload(row)
         }
         seen |= {("failed", failure.content) for failure in state.failed.values()}
-        seen |= {("acknowledged", key) for key in state.acknowledged if not key.startswith("log-waiting")}
+        seen |= {("acknowledged", key) for key in state.acknowledged}
         seen |= {("tag", each.log, *tag) for each in state.facts["tags"].values() for tag in each.tags.items()}
         seen |= {("map", each.name) for each in state.maps.values()}
         return seen | {("output", where) for where in state.outputs}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 import os
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 from tcpipe.errors import RecipeError
 from tcpipe.formats.json_files import Json, digest, to_plain
-from tcpipe.recipe import IngestSections, Recipe, TableMapping, TimeWindow
+from tcpipe.recipe import IngestSections, Recipe, TableMapping
 from tcpipe.recipe.checking import TO_MEASURE, as_toml, describe, format_values, from_values, read_annotations
 from tcpipe.robots import GENERIC, PowerSource, Profiles, Robot
 
@@ -47,50 +46,13 @@ def load_recipe(path: Path | None) -> Recipe:
             data = stream.read(_MOST_BYTES + 1)
         if len(data) > _MOST_BYTES:
             raise RecipeError(f"{path}: is larger than {_MOST_BYTES / 1e6:g} MB, which no recipe is")
-        return _add_windows(parse_recipe(parse_toml(data.decode("utf-8")), where=str(path)), path)
+        return parse_recipe(parse_toml(data.decode("utf-8")), where=str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path}: the recipe cannot be read ({getattr(error, 'strerror', None) or error})") from None
     except RecursionError:
         raise RecipeError(f"{path}: not a recipe: its values are nested too deep") from None
     except ValueError as error:  # no TOML, or a number of thousands of digits
         raise RecipeError(f"{path}: not valid TOML: {error}") from None
-
-
-def _add_windows(recipe: Recipe, path: Path) -> Recipe:
-    """Return the recipe with the time windows of its CSV file, which it names no more."""
-    if not recipe.mask.windows_csv:
-        return recipe
-    file = path.parent / recipe.mask.windows_csv
-    windows = list(recipe.mask.windows)
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise RecipeError(f"{path}: mask.windows_csv: {file} cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError as error:
-        raise RecipeError(f"{path}: mask.windows_csv: {file} is not UTF-8 at byte {error.start}") from None
-    lines = text.splitlines()
-    separator = next((mark for mark in ";\t" if lines and mark in lines[0]), ",")
-    for number, row in enumerate(csv.DictReader(lines, delimiter=separator), 2):
-        if None in row:
-            raise RecipeError(
-                f"{file}, line {number}: it has more cells than the first line, {lines[0]}; got {lines[number - 1]}"
-            )
-        cells = {str(name).strip(): str(value).strip() for name, value in row.items() if value}
-        decimal = "," if separator == ";" else "."
-        given = {
-            name: value if name == "run" else _read_cell(value.replace(decimal, "."))
-            for name, value in cells.items()
-            if value
-        }
-        windows.append(from_values(TimeWindow, given, where=f"{file}, line {number}"))
-    return replace(recipe, mask=replace(recipe.mask, windows=windows, windows_csv=None))
-
-
-def _read_cell(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def resolve_recipe(given: Recipe | str | Path | None) -> Recipe:

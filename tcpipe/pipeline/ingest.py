@@ -201,9 +201,7 @@ def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> N
     run_ids = sorted({row.run_id for row in state.runs.values()})
     for pattern, window in {time_window.run: time_window for time_window in windows}.items():
         if run_ids and not any(map(window.is_for, run_ids)):
-            text = (
-                "recipe mask.windows (or its CSV file): run = %r fits no run, so its windows have no effect; runs: %s"
-            )
+            text = "recipe mask.windows: run = %r fits no run, so its windows have no effect; runs: %s"
             logger.warning(text, pattern, list_first(run_ids, _MOST_RUNS))
 
 

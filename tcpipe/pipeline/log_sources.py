@@ -97,12 +97,6 @@ class LogSource:
         """When a file of the log was last written [ns since 1970]."""
         return max((time_ns for _, time_ns in self.files), default=0)
 
-    @property
-    def arrival_ns(self) -> int:
-        """When a file of the log last came here or was changed [ns since 1970], which a copy that keeps its time does not hide."""
-        times = (seen.st_ctime_ns for path in self.paths for seen in _stat_files(path))
-        return self.youngest_ns if self.urls else max(times, default=0)
-
     def now(self) -> LogSource:
         """Return the log as it is now: a file that was written since has another content; object storage is not listed again."""
         if self.urls:

@@ -11,7 +11,7 @@ from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.runs import Call, Problem, Run, RunFacts, find_problems, make_failure
 from tcpipe.pipeline.calls import ACKNOWLEDGE, BUILD, INGEST, close_call, list_open_calls, record_call
-from tcpipe.pipeline.log_sources import LogSource, find_sources
+from tcpipe.pipeline.log_sources import find_sources
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Subject, make_finding
 
@@ -43,12 +43,6 @@ def find_incomplete_maps(state: State, name: str | None = None) -> Iterator[Prob
                 "map-incomplete", Subject("map", record.name), names={"file": f"blobs/{record.blob}"}
             )
             yield Problem(finding, f"{record.name} {record.blob}")
-
-
-def make_waiting(source: LogSource, state: str) -> Problem:
-    """Return the problem that no call ingests a log; if the log is written again, it is another problem."""
-    finding = make_finding("log-waiting", Subject("log", source.name), names={"state": state})
-    return Problem(finding, source.files_digest, source.origins)
 
 
 def make_missing(path: str, state: State) -> Problem:
@@ -115,7 +109,6 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
                 or list(find_incomplete_runs(state, name))
                 or list(find_incomplete_maps(state, name))
                 or _make_missing_problem(name, state)
-                or _make_waiting_problem(name, state)
             )
             if len({problem.name for problem in found}) == 1:
                 chosen |= {problem.key: problem for problem in found}
@@ -170,13 +163,6 @@ def _make_missing_problem(name: str, state: State) -> list[Problem]:
         return []
     with make_scratch_directory() as staging:
         return [make_missing(path, state)] if find_sources([path], as_one=False, staging=staging).problems else []
-
-
-def _make_waiting_problem(name: str, state: State) -> list[Problem]:
-    """Return the problem that a log is not in the store, by its path or URL: the user wants no report that it waits."""
-    with make_scratch_directory() as staging:
-        sources = find_sources([name], as_one=False, staging=staging).sources
-    return [make_waiting(source, "pending") for source in sources if state.find_seen(source.origins) is None]
 
 
 def _describe_no_match(

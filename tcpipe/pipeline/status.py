@@ -5,7 +5,6 @@ Nothing is read of a log but its size and time.
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,14 +16,13 @@ from tcpipe.errors import UsageError, clean_lines
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_finding, group_findings
-from tcpipe.formats.object_storage import format_path, make_absolute
+from tcpipe.formats.object_storage import format_path
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Call, Problem
 from tcpipe.pipeline.calls import (
     INGEST,
     OpenCall,
     format_duration,
-    is_below,
     list_ended_calls,
     list_open_calls,
 )
@@ -37,7 +35,6 @@ from tcpipe.pipeline.problems import (
     find_incomplete_runs,
     find_stale_outputs,
     make_missing,
-    make_waiting,
 )
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
@@ -45,7 +42,6 @@ from tcpipe.tables.findings import Finding
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7
-_TWO_NIGHTS_NS = 2 * 86_400 * 10**9
 _IN_WORDS: Mapping[LogState, str] = {
     "failed_permanent": "failed for what it holds",
     "failed_transient": "failed for now",
@@ -82,7 +78,7 @@ class Status:
     groups: tuple[Group, ...]
     """By state and cause."""
     problems: tuple[Finding, ...]
-    """Sources that cannot be read, runs that are not complete, logs that wait for too long, calls that were killed, damaged documents,
+    """Sources that cannot be read, runs that are not complete, calls that were killed, damaged documents,
     outputs that are out of date or whose last call failed."""
     gone: tuple[str, ...]
     """Sources that cannot be read and that only calls before the latest ingest were given."""
@@ -135,8 +131,6 @@ def find_status(options: IngestOptions, *, create: bool = False) -> Status:
         *find_incomplete_maps(state),
         *(call.problem for call in killed),
     ]
-    if not create and len(killed) == len(open_calls) and all(is_below(make_absolute(log), [*asked]) for log in given):
-        problems += _find_waiting(steps)
     problems += [make_missing(path, state) for path in missing if path in lately]
     problems += [] if create else find_stale_outputs(opened, state)
     problems = [problem for problem in problems if problem.key not in acknowledged]
@@ -217,17 +211,6 @@ def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str
 
 def _count_logs(logs: Sequence[str]) -> str:
     return f"{len(logs)} log{'s' * (len(logs) != 1)}"
-
-
-def _find_waiting(steps: Iterable[PlannedLog]) -> Iterator[Problem]:
-    """Yield the logs that arrived more than two nights ago and were never ingested.
-
-    The file system states the time of arrival, since a copy may keep the modification time.
-    """
-    before_ns = time.time_ns() - _TWO_NIGHTS_NS
-    for step in steps:
-        if step.state in ("pending", "growing") and not step.has_failed and step.task.source.arrival_ns < before_ns:
-            yield make_waiting(step.task.source, step.state)
 
 
 def _iterate_groups(steps: Iterable[PlannedLog]) -> Iterator[Group]:

@@ -233,8 +233,6 @@ class MaskConfig(_Section):
     """Rows whose horizontal position has a larger standard deviation (DRMS) are masked; default: no limit [m]."""
     windows: list[TimeWindow] = field(default_factory=list, metadata=LEFT_OUT)
     """Spans of runs that are kept or dropped, as {run = "farm_*", action = "drop", start = 0, end = 30}."""
-    windows_csv: str | None = field(default=None, metadata=LEFT_OUT)
-    """More of them: a CSV file beside the recipe, with columns run, action, start, end."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ import sys
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
@@ -22,7 +21,6 @@ from tcpipe.formats import documents
 from tcpipe.formats.runs import Call
 from tcpipe.pipeline import calls
 from tcpipe.pipeline import ingest as ingest_module
-from tcpipe.pipeline import status as status_module
 from tcpipe.pipeline.calls import close_call, identify_process, list_open_calls, record_call
 from tcpipe.pipeline.ingest import CallOptions, ingest
 from tcpipe.pipeline.problems import acknowledge
@@ -301,40 +299,6 @@ def test_a_call_that_runs_is_told_from_a_killed_one_as_far_as_can_be_seen(tmp_pa
     assert call.state == state
     if state == "killed":
         assert call.problem.finding.code == ("call-lost" if "host" in other else "call-killed")
-
-
-def test_logs_that_nobody_takes_in_for_more_than_two_nights_are_a_problem(tmp_path, logs, monkeypatch):
-    store, now_ns = tmp_path / "store", status_module.time.time_ns
-    ingest([logs], store=store, recipe=Recipe())
-    drive_at(logs / "new.mcap", seed=2, start_ns=START_NS + 10**14)
-    drive_at(logs / "future.mcap", seed=3, start_ns=START_NS + 2 * 10**14)
-    os.utime(logs / "new.mcap", ns=(10**18, 10**18))
-    os.utime(logs / "future.mcap", ns=(4 * 10**18, 4 * 10**18))
-
-    def after(nights):
-        later = SimpleNamespace(time_ns=lambda: now_ns() + nights * NIGHT_S * 10**9 + 10**9)
-        monkeypatch.setattr(status_module, "time", later)
-        return ask_status(store)
-
-    assert after(0).exit_code == 0, "a copy keeps its old modification time; it came today"
-    assert after(1).exit_code == 0
-    found = after(2)
-    assert (found.exit_code, found.counts) == (3, {"done": 2, "pending": 1, "growing": 1})
-    assert {(of.code, of.subject.name, of.names["state"]) for of in found.problems} == {
-        ("log-waiting", str(logs / "new.mcap"), "pending"),
-        ("log-waiting", str(logs / "future.mcap"), "growing"),
-    }
-    with record_call(open_store(store), "ingest", [str(logs)], CallOptions()):
-        assert after(2).exit_code == 0, "somebody is at it"
-    elsewhere = drive_at(tmp_path / "archive" / "old.mcap", seed=4)
-    os.utime(elsewhere, ns=(10**18, 10**18))
-    monkeypatch.setattr(status_module, "time", SimpleNamespace(time_ns=lambda: now_ns() + 9 * NIGHT_S * 10**9))
-    assert ask_status(store, elsewhere.parent).exit_code == 0, "no ingest was asked for it"
-    acknowledge([str(logs / "new.mcap"), str(logs / "future.mcap")], store=store)
-    assert after(9).exit_code == 0
-    os.utime(logs / "future.mcap")
-    assert ingest([logs], store=store, recipe=Recipe()).exit_code == 0
-    assert after(9).counts == {"done": 4}
 
 
 def test_a_store_that_cannot_be_written_is_built_from_and_asked_as_ever(tmp_path, logs, monkeypatch):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from made_tracks import make_track, stamps, straight_track, with_columns
 
-from tcpipe.errors import FusionError, RecipeError
-from tcpipe.formats.recipe_toml import ingest_key, load_recipe
+from tcpipe.errors import FusionError
 from tcpipe.recipe import MaskConfig, SegmentConfig, TimeWindow
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
@@ -281,40 +280,3 @@ def test_a_window_goes_before_every_other_reason_and_others_runs_do_not_count():
     other = gate(standing, config=windows(("another*", "keep", 0, 1)))
     assert not rows_of(other, DropReason.TIME_WINDOW).any()
     assert "time-window-empty" in codes_of(gate(standing, config=windows(("*", "drop", 900, 950))))
-
-
-def test_windows_of_a_csv_file_are_those_of_the_recipe(tmp_path):
-    (tmp_path / "tcpipe.toml").write_text(
-        "[mask]\nwindows_csv = 'windows.csv'\nwindows = [{run = 'a', start = 2025-11-18T21:40:00Z}]\n"
-    )
-    (tmp_path / "windows.csv").write_text("run, action,start,end\nfield_*,keep,12.5,\nb,drop,,2025-11-18 21:40:00\n")
-    found = load_recipe(tmp_path / "tcpipe.toml")
-    utc = "2025-11-18T21:40:00+00:00"
-    assert found.mask.windows == [
-        TimeWindow("a", "drop", utc), TimeWindow("field_*", "keep", 12.5), TimeWindow("b", "drop", None, "2025-11-18 21:40:00"),
-    ]  # fmt: skip
-    assert (
-        found.mask.windows[0].find_bounds_ns(5)[0] == found.mask.windows[2].find_bounds_ns(5)[1] == 1763502000 * 10**9
-    )
-    before = ingest_key(found)
-    (tmp_path / "windows.csv").write_text("run,action,start,end\nfield_*,keep,12.6,\n")
-    assert ingest_key(load_recipe(tmp_path / "tcpipe.toml")) != before
-    (tmp_path / "windows.csv").write_text("run,action,start,end\nb,skip,soon,1\n")
-    with pytest.raises(RecipeError) as caught:
-        load_recipe(tmp_path / "tcpipe.toml")
-    assert "windows.csv, line 2: action is" in caught.value.problems[0]
-    (tmp_path / "windows.csv").write_text("run,action,start,end\nb,drop,soon,1\n")
-    with pytest.raises(RecipeError, match="seconds, or UTC"):
-        load_recipe(tmp_path / "tcpipe.toml")
-    (tmp_path / "windows.csv").write_text("\ufeffrun;action;start;end\nb,c;keep;0,5;1\n", encoding="utf-8")
-    assert load_recipe(tmp_path / "tcpipe.toml").mask.windows[1:] == [TimeWindow("b,c", "keep", 0.5, 1.0)]
-    for content, said in (
-        (b"run,action\nb,drop,0,1\n", "line 2: it has more cells"),
-        (b"run\n\xe9\n", "not UTF-8 at byte 4"),
-    ):
-        (tmp_path / "windows.csv").write_bytes(content)
-        with pytest.raises(RecipeError, match=said):
-            load_recipe(tmp_path / "tcpipe.toml")
-    (tmp_path / "windows.csv").unlink()
-    with pytest.raises(RecipeError, match="cannot be read"):
-        load_recipe(tmp_path / "tcpipe.toml")
