@@ -19,7 +19,7 @@ from tcpipe.formats.runs import Call, LogFailure, StoredMap
 from tcpipe.pipeline import report as report_module
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.report import find_changes, find_shift, report
+from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store
@@ -226,27 +226,3 @@ def test_many_runs_are_all_told_and_some_can_be_read_without_scripts(store, monk
     assert len(rows) == 5
     assert "Without scripts the table shows the first 2 of 5." in html
     assert html.split("<h2>All runs</h2>")[1].split("</section>")[0].count("<tr>") == 3
-
-
-def test_a_change_is_told_from_scatter():
-    scatter = np.random.default_rng(3).normal(84.0, 1.0, 20)
-    assert find_shift(scatter) is None
-    assert find_shift(scatter[:11]) is None
-    found = find_shift([*scatter[:15], *(scatter[15:] + 12.0)])
-    assert (found["earlier_count"], found["latest_count"]) == (15, 5)
-    assert find_shift([*np.tile(scatter, 50), *(scatter + 12.0)])["latest_count"] == 20
-    assert found["after"] - found["before"] == pytest.approx(12.0, abs=1.0)
-    assert find_shift([5.0] * 20) is None
-    assert find_shift([5.0] * 15 + [5.2] * 5) is None  # 4 % of what it was
-    assert find_shift([5.0] * 15 + [6.0] * 5) is not None
-
-
-def test_a_change_from_run_to_run_is_a_finding_of_its_robot(tmp_path):
-    store = open_store(tmp_path / "store", create=True)
-    for number in range(16):
-        add(store, f"run{number}", number, distance_by_reason_m={"kept": 20.0, "gap": 20.0 if number > 11 else 1.0})
-    (change,) = find_changes([run.facts for run in store.runs()])
-    assert (change.code, change.severity, change.names["robot"]) == ("run-to-run-change", "note", "husky")
-    assert change.numbers["before"] == pytest.approx(100 * 20 / 21)
-    assert change.numbers["after"] == pytest.approx(50.0)
-    assert "used share of the distance of husky: 95.2 % in 12 runs, 50 % in the latest 4" in shown(store)[1]
