@@ -71,7 +71,6 @@ SMALLEST = {
     ),
     "label_accuracy": Smallest("--scenario tiny", rf"odometer +[+-]?{NUMBER}%"),
     "load_dataset": Smallest("{out} 300", rf"epoch from disk, zstd: {NUMBER} x memmap"),
-    "map_shift": Smallest("--sites 1", r"alone[\s\S]*shared"),
     "many_runs": Smallest("{out} 3", rf"build-dataset, cold +{NUMBER} s wall"),
     "path_coverage": Smallest("--train 2 --metres 60 --further 1 --models 1", rf"energy +1 m: +{NUMBER} %"),
     "peers": Smallest(

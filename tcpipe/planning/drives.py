@@ -176,7 +176,7 @@ def collect_runs(
     """
     runs = [find_drive(store, log) for log in logs]
     recipe = replace(Recipe(), read=runs[0].manifest.recipe.read) if data is None else data.card.recipe
-    shifts, collected = find_shifts(store, source, recipe, runs, data)[0], list[Run]()
+    shifts, collected = find_shifts(source, recipe, runs)[0], list[Run]()
     for run in runs:
         shift = shifts.get(run.run_id, (0.0, 0.0, 0.0))
         found, reasons = predict_run(model, source, run, sample=recipe.sample, shift=shift)
@@ -194,19 +194,12 @@ def _list_names(reasons: Reasons) -> list[str]:
     return sorted({name for why in reasons for name in why})
 
 
-def find_shifts(
-    store: Store, source: MapFile, recipe: Recipe, runs: Sequence[StoredRun], data: Dataset | None = None
-) -> tuple[Shifts, list[Finding]]:
-    """Return where runs lie on a map, with those of a dataset that are in the store, and findings; nothing without ``sample.align``."""
+def find_shifts(source: MapFile, recipe: Recipe, runs: Sequence[StoredRun]) -> tuple[Shifts, list[Finding]]:
+    """Return how far runs are moved on a map, and findings; nothing without ``sample.align``."""
     if not recipe.sample.align:
         return {}, []
-    known = {(run.run_id, run.recipe_id) for run in runs}
-    known |= set() if data is None else {(run.run_id, run.recipe_id) for run in data.card.runs}
-    together = [run for run in store.runs() if (run.run_id, run.recipe_id) in known]
-    registrations, found = register_runs(together, source, recipe)
-    names = {run.run_id for run in runs}
-    moved = [finding for finding in found if finding.subject.kind != "run" or finding.subject.name in names]
-    return list_shifts(registrations), moved
+    registrations, findings = register_runs(runs, source, recipe)
+    return list_shifts(registrations), findings
 
 
 def compute_drive_cost(
@@ -306,13 +299,13 @@ def evaluate_drives(
 ) -> DrivesResult:
     """Compare drives with a model's predictions and write ``drives.json`` into the directory ``out``, or to a URL.
 
-    If the dataset's runs were moved onto their map (``sample.align``), drives are moved together with those in the store.
+    If the dataset's runs were moved onto their map (``sample.align``), drives are moved, too.
 
     Raises `ModelError`, `MapError` or `UsageError` where the model, the map or a drive cannot be used, or ``out`` is a file.
     """
     opened = open_store(store)
     runs = [find_drive(opened, log) for log in logs]
-    shifts, moved = find_shifts(opened, source, data.card.recipe, runs, data)
+    shifts, moved = find_shifts(source, data.card.recipe, runs)
     found = tuple(
         compute_drive_cost(model, source, run, data, log=log, shifts=shifts)
         for run, log in zip(runs, logs, strict=True)

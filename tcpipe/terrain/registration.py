@@ -1,4 +1,4 @@
-"""Registration of a map to tracks by the heights of the ground under them: the horizontal shift, and the unit of the map's heights.
+"""Registration of a map to a track by the heights of the ground under it: the horizontal shift, and the unit of the map's heights.
 
 Heights of track and map differ by a constant (geoid, the robot's own height). The rest is the shape of the ground. The shift at which the
 two shapes agree best is searched on a lattice, as in terrain-aided navigation (Hollowell 1990; Nuth & Kääb 2011), and refined by a
@@ -10,15 +10,13 @@ not vary, or repeats itself: there the shift is not observable, and stays zero.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
-from scipy.optimize import brentq, least_squares
-from scipy.stats import chi2
+from scipy.optimize import least_squares
 
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
@@ -49,14 +47,14 @@ _PARABOLOID = np.linalg.pinv(
 )
 _SPACING_M, _DRIFT_M, _CLIFF_M = 0.5, 25.0, 1.0
 """Spacing of points; path over which the track's heights have one error; relief among near shifts that no robot drives on [m]."""
-_FEWEST_POINTS, _MOST_POINTS, _MOST_TOGETHER = 60, 1_200, 6_000
-"""Fewest points, and most of one track and of several."""
+_FEWEST_POINTS, _MOST_POINTS = 60, 1_200
+"""Fewest and most points of a track."""
 _BLOCKS, _DRAWS, _FEW_BLOCKS = 12, 200, 1.38
 """Blocks of the path, draws of them, and factor of a variance by so few: 12 / 11, and the squared ratio of Student's t and normal."""
 _SIGMAS, _OUTLIER, _EDGE_M = 5.0, 3.5, 0.75 * _STEP_M
 """Standard deviations by which a shift lowers the misfit, and of an outlier; least step from the best inner shift beyond the edge [m]."""
-_CHI2_999, _AGREE, _SCATTER_QUANTILE = 13.82, 0.999, 0.1
-"""99.9 % of χ² with two degrees of freedom; probabilities that runs agree, and below their scatter."""
+_CHI2_999 = 13.82
+"""99.9 % of χ² with two degrees of freedom."""
 _LEAST_GAIN = -2.0 * np.log(0.9)
 """A shift that leaves more than 90 % of the misfit is not what was wrong."""
 _RIDGE = 1e-12
@@ -149,44 +147,41 @@ class Registration:
         return self.shifted_misfit_m if self.significant else self.misfit_m
 
 
-def register_tracks(source: MapReader, tracks: Sequence[tuple[FloatArray, FloatArray]]) -> Registration | None:
-    """Return the one horizontal shift at which the map's ground fits the heights of tracks best.
+def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) -> Registration | None:
+    """Return the horizontal shift at which the map's ground fits the heights of a track best.
 
     None where fewer than 60 points, half a metre apart, lie well inside the map and on its ground.
 
     Parameters
     ----------
     source : the map.
-    tracks : of each track the positions in the map's CRS, in the order driven, shape (N, 2) [m], of which what is not finite or not on the
-        map is passed over, and their heights above any surface, shape (N,) [m].
+    xy_m : positions in the map's CRS, in the order driven, shape (N, 2) [m]; positions that are not finite or not on the map are skipped.
+    height_m : their heights above any surface, shape (N,) [m].
     """
-    level, thinned = choose_level(source, _STEP_M), thin_tracks(tracks)
-    xy_m, height_m = (np.concatenate([each[part] for each in thinned]) for part in (0, 1))
-    track = np.repeat(np.arange(len(thinned)), [len(each[1]) for each in thinned])
+    level, (xy_m, height_m) = choose_level(source, _STEP_M), _thin_track(xy_m, height_m)
     rows = np.flatnonzero(level.grid.contains(xy_m))
     ground_m = _sample_heights(level, xy_m[rows])
     whole = np.isfinite(ground_m).all(axis=(1, 2))
     if whole.sum() < _FEWEST_POINTS:
         return None
     rows, ground_m = rows[whole], ground_m[whole]
-    xy_m, height_m, track = xy_m[rows], height_m[rows], track[rows]
+    xy_m, height_m = xy_m[rows], height_m[rows]
     excess_m = ground_m - height_m[:, None, None]
-    near, good = _find_ground(excess_m, xy_m, track)
+    near, good = _find_ground(excess_m, xy_m)
     if near.sum() < _FEWEST_POINTS:
         return None
     scale = _fit_height_scale(ground_m[near], height_m[near], xy_m[near])
-    return _refine_shift(excess_m[near], excess_m[good], xy_m[good], track[good], scale)
+    return _refine_shift(excess_m[near], excess_m[good], xy_m[good], scale)
 
 
-def thin_tracks(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> list[tuple[FloatArray, FloatArray]]:
-    """Return finite points of tracks half a metre of path apart, or further where that would be too many."""
-    finite = [np.isfinite(xy_m).all(axis=1) & np.isfinite(z_m) for xy_m, z_m in tracks]
-    tracks = [(xy_m[used], z_m[used]) for (xy_m, z_m), used in zip(tracks, finite, strict=True)]
-    paths_m = [np.append(0.0, np.cumsum(np.hypot(*np.diff(xy_m, axis=0).T)))[: len(xy_m)] for xy_m, _ in tracks]
-    total_m = sum(path_m[-1] for path_m in paths_m if path_m.size)
-    spacing_m = max(_SPACING_M, total_m / (_MOST_POINTS if len(tracks) == 1 else _MOST_TOGETHER))
-    rows = [np.unique((path_m / spacing_m).astype(np.int64), return_index=True)[1] for path_m in paths_m]
-    return [(xy_m[at], z_m[at]) for (xy_m, z_m), at in zip(tracks, rows, strict=True)]
+def _thin_track(xy_m: FloatArray, height_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return finite points half a metre of path apart, or further apart if there are too many."""
+    is_finite = np.isfinite(xy_m).all(axis=1) & np.isfinite(height_m)
+    xy_m, height_m = xy_m[is_finite], height_m[is_finite]
+    path_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(xy_m, axis=0).T)))[: len(xy_m)]
+    spacing_m = max(_SPACING_M, path_m[-1] / _MOST_POINTS) if path_m.size else _SPACING_M
+    rows = np.unique((path_m / spacing_m).astype(np.int64), return_index=True)[1]
+    return xy_m[rows], height_m[rows]
 
 
 def _sample_heights(level: MapReader, xy_m: FloatArray) -> FloatArray:
@@ -203,7 +198,7 @@ def _sample_heights(level: MapReader, xy_m: FloatArray) -> FloatArray:
     return found + level.height_reference_m
 
 
-def _find_ground(excess_m: FloatArray, xy_m: FloatArray, track: Rows) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _find_ground(excess_m: FloatArray, xy_m: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the points on the map's ground at the shift that fits best, (N,), and those of them that determine a shift.
 
     These are not on cliffs, unless too few are left.
@@ -219,7 +214,7 @@ def _find_ground(excess_m: FloatArray, xy_m: FloatArray, track: Rows) -> tuple[N
         good = near & (relief_m < _CLIFF_M)
         if good.sum() < _FEWEST_POINTS:
             return near, near
-        before, best = best, _find_least(_flatten(excess_m[good], xy_m[good], track[good])[0].var(axis=0))
+        before, best = best, _find_least(_flatten(excess_m[good], xy_m[good])[0].var(axis=0))
         if best == before:
             break
     return near, good
@@ -238,14 +233,14 @@ def _find_least(spread: FloatArray) -> tuple[int, int]:
     return int(i), int(j)
 
 
-def _flatten(excess_m: FloatArray, xy_m: FloatArray, track: Rows) -> tuple[FloatArray, FloatArray, Rows]:
+def _flatten(excess_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatArray, Rows]:
     """Return the excess without tilt and drift, constant in each stretch of path; the columns of a tilt, (N, 2); each point's block."""
     path_m = np.cumsum(np.hypot(*np.diff(xy_m, axis=0, prepend=xy_m[:1]).T))
     count = max(_BLOCKS, round(float(path_m[-1]) / _DRIFT_M))
-    place = track, np.minimum(path_m * count // path_m[-1], count - 1)
-    _, first, stretch, sizes = np.unique(place, axis=1, return_index=True, return_inverse=True, return_counts=True)
+    place = np.minimum(path_m * count // path_m[-1], count - 1)
+    _, first, stretch, sizes = np.unique(place, return_index=True, return_inverse=True, return_counts=True)
     flat_m, tilt = (each - (np.add.reduceat(each, first).T / sizes).T[stretch] for each in (excess_m, xy_m))
-    # Blocks of stretches near each other: errors of the map are alike wherever several tracks pass.
+    # Blocks of stretches near each other: errors of the map are alike wherever the track passes again.
     east_m, north_m = ((xy_m - tilt)[first] - xy_m.min(axis=0)).T
     rank = np.argsort(np.argsort(compute_morton(east_m.astype(np.int64), north_m.astype(np.int64)), kind="stable"))
     return _remove_tilt(flat_m, tilt), tilt, (rank * min(_BLOCKS, len(sizes)) // len(sizes))[stretch]
@@ -278,11 +273,9 @@ def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
     return HeightScale(float(products[best] / (squares[best] + _RIDGE)), std, float(explained[best]))
 
 
-def _refine_shift(
-    near_m: FloatArray, good_m: FloatArray, xy_m: FloatArray, track: Rows, scale: HeightScale
-) -> Registration:
+def _refine_shift(near_m: FloatArray, good_m: FloatArray, xy_m: FloatArray, scale: HeightScale) -> Registration:
     """Return the best shift of the lattice, refined by the excess at good points; misfits are those of near points."""
-    flat_m, tilt, block = _flatten(good_m, xy_m, track)
+    flat_m, tilt, block = _flatten(good_m, xy_m)
     squares = _resample_squares(flat_m, tilt, block)
     at, paraboloids = _fit_paraboloids(squares)
     curvature, axes = np.linalg.eigh(paraboloids[:, [3, 4, 4, 5]].reshape(-1, 2, 2))
@@ -340,65 +333,6 @@ def _estimate_covariance(without: FloatArray) -> FloatArray:
     """Return the covariance of an estimate by its values with each block left out, shape (B, K)."""
     spread = without - without.mean(axis=0)
     return np.asarray((len(without) - 1) / len(without) * spread.T @ spread)
-
-
-@dataclass(frozen=True, slots=True)
-class SharedShift:
-    """The shift that a run takes from all runs of a map, if any, and how far its own is from theirs [m], NaN where they agree."""
-
-    registration: Registration | None
-    difference_m: float
-
-
-def share_shift(
-    alone: Sequence[Registration], together: Registration | None, track_std_m: FloatArray
-) -> list[SharedShift]:
-    """Return what each of several runs takes from a registration of all ``together``.
-
-    The shift that all have in common, plus each run's own about it: by the standard deviation (DRMS) of its track, (N,) [m], and by what
-    the runs' shifts scatter more. None is taken where they contradict each other, or too few are determined to bound their scatter.
-    """
-    shift_m = np.array([registration.shift_xy_m for registration in alone])
-    covariance = np.stack([registration.covariance for registration in alone])
-    widened = covariance + np.square(track_std_m)[:, None, None] / 2.0 * np.eye(2)
-    weights = np.linalg.inv(widened)
-    mean_m = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, shift_m))
-    freedom = int(_count_known(covariance).sum()) - 2
-    none = [SharedShift(None, float("nan")) for _ in alone]
-    if freedom <= 0:
-        return none
-    if _square(shift_m - mean_m, widened).sum() > chi2.ppf(_AGREE, freedom):
-        return _find_contradictions(shift_m, widened)
-    if together is None or together.at_reach or not np.isfinite(together.position_std_m):
-        return none
-    error_m = shift_m - together.shift_xy_m
-
-    def exceed(scatter: float) -> float:
-        """Return by how much the squared errors exceed their lower quantile."""
-        squares = _square(error_m, widened + scatter * np.eye(2))
-        return float(squares.sum() - chi2.ppf(_SCATTER_QUANTILE, freedom))
-
-    scatter = float(brentq(exceed, 0.0, 1e6)) if exceed(0.0) > 0.0 else 0.0
-    shared = together.covariance + widened - covariance + scatter * np.eye(2)
-    shift_xy_m, left_m = together.shift_xy_m, together.shifted_misfit_m
-    return [
-        SharedShift(replace(own, shift_xy_m=shift_xy_m, shifted_misfit_m=left_m, covariance=wider), np.nan)
-        for own, wider in zip(alone, shared, strict=True)
-    ]
-
-
-def _find_contradictions(shift_m: FloatArray, covariance: FloatArray) -> list[SharedShift]:
-    """Return how far the shifts of runs, (N, 2) [m], are from the median of those that are determined; NaN where by chance."""
-    is_known = _count_known(covariance) > 1
-    error_m = shift_m - (np.median(shift_m[is_known], axis=0) if is_known.any() else shift_m)
-    squares = np.where(is_known, _square(error_m, covariance), 0.0)
-    is_odd = is_known & (squares >= min(_CHI2_999, squares.max()))
-    return [SharedShift(None, float(apart_m)) for apart_m in np.where(is_odd, np.hypot(*error_m.T), np.nan)]
-
-
-def _square(error_m: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return squared errors over their variances, (N,)."""
-    return np.asarray(np.einsum("ni,nij,nj->n", error_m, np.linalg.inv(covariance), error_m))
 
 
 def _count_known(covariance: FloatArray) -> Rows:

@@ -28,18 +28,13 @@ from tcpipe.terrain.registration import (
     REACH_M,
     HeightScale,
     Registration,
-    SharedShift,
-    register_tracks,
-    share_shift,
-    thin_tracks,
+    register_track,
 )
 from tcpipe.terrain.sampling import find_classes_at
 from tcpipe.terrain.tiles import find_map_projection
 
 _COLUMNS = ["lon_deg", "lat_deg", "alt_m", "x_std_m", "y_std_m", "z_std_m"]
 _DATUM, _BLOCKED = "map-height-datum", "driven-not-traversable"
-_MOST_RUNS = 30
-"""Registered together at most: more of them thin the points of each."""
 
 
 def register_runs(
@@ -56,26 +51,18 @@ def register_runs(
     wrong = [run_id for run_id, scale in scales.items() if scale.is_wrong()]
     if wrong and not any(scale.is_known and not scale.is_off() for scale in scales.values()):
         raise MapError(_describe_scale(scales[wrong[0]], wrong[0], source))
-    shared = _share_shift(tracks, source, is_wanted=recipe.sample.align)
     registrations, findings = list[MapRegistration](), list[Finding]()
     for track in tracks:
-        given = shared.get(track.run_id)
-        found = track.choose_shift(given) if recipe.sample.align else track.found
-        reason = track.find_obstacle(found, recipe.sample.max_position_std_m) if recipe.sample.align else "not wanted"
+        found = track.found
+        reason = track.find_obstacle(recipe.sample.max_position_std_m) if recipe.sample.align else "not wanted"
         subject, names = Subject("run", track.run_id), {"map": source.name}
         if recipe.sample.align and reason and np.isfinite(track.std_m):
             findings.append(make_finding("map-not-aligned", subject, names=names | {"reason": reason}))
-        if track.found is None or found is None:
+        if found is None:
             continue
-        used = track.found if reason else found
-        registrations.append(_make_map_registration(track.run_id, used, track.expected_m, is_applied=not reason))
-        findings += _find_shift(used, track.run_id, source.name, is_applied=not reason)
-        findings += _find_other_heights(track.found, track.expected_m, track.run_id, source.name)
-        if given is not None and np.isfinite(given.difference_m):
-            std_m = float(np.hypot(track.found.position_std_m, track.std_m))
-            findings.append(
-                make_finding("map-shifts-differ", subject, names=names, difference_m=given.difference_m, std_m=std_m)
-            )
+        registrations.append(_make_map_registration(track.run_id, found, track.expected_m, is_applied=not reason))
+        findings += _find_shift(found, track.run_id, source.name, is_applied=not reason)
+        findings += _find_other_heights(found, track.expected_m, track.run_id, source.name)
     if recipe.sample.align:
         geoid_m = compute_geoid_height(*np.reshape(projection.area_deg, (2, 2)).mean(axis=0).tolist())
         findings += _find_height_datum(registrations, source.name, geoid_m)
@@ -84,13 +71,12 @@ def register_runs(
 
 @dataclass(frozen=True, slots=True)
 class _Track:
-    """A run's certain positions on the map, thinned, in its plane, and their heights [m], and the map's registration against it.
+    """The map's registration against a run's certain positions on it.
 
     ``expected_m`` is the expected misfit, ``std_m`` the median DRMS of the track on the map, NaN beside it [m].
     """
 
     run_id: str
-    points: tuple[NDArray[np.float64], NDArray[np.float64]]
     found: Registration | None
     expected_m: float
     std_m: float
@@ -105,32 +91,15 @@ class _Track:
             return f"the shift may be beyond {REACH_M:g} m"
         return "heights differ" if _is_other_ground(self.found.shape_misfit_m, self.expected_m) else ""
 
-    def choose_shift(self, given: SharedShift | None) -> Registration | None:
-        """Return the more certain of the run's own shift and the one that all runs share."""
-        if self.found is None or given is None or given.registration is None:
-            return self.found
-        return self.found if self.found.position_std_m <= given.registration.position_std_m else given.registration
-
-    def find_obstacle(self, found: Registration | None, max_std_m: float) -> str:
+    def find_obstacle(self, max_std_m: float) -> str:
         """Return why a shift cannot be applied; "" where it can: its DRMS and the track's together are at most ``max_std_m``."""
+        found = self.found
         if found is None or self.find_misfit():
             return self.find_misfit()
         if not np.isfinite(found.position_std_m):
             return "the ground does not determine the shift"
         is_known = found.position_std_m <= np.sqrt(max_std_m**2 - self.std_m**2)
         return "" if is_known else f"the shift is known only to {found.position_std_m:.2f} m"
-
-
-def _share_shift(tracks: Sequence[_Track], source: MapFile, *, is_wanted: bool) -> dict[str, SharedShift]:
-    """Return by run what runs that fit the map's ground take from all of them, if that is wanted, and whether they agree."""
-    fitting = [(track, track.found) for track in tracks if track.found is not None and not track.find_misfit()]
-    if len(fitting) < 2:
-        return {}
-    every = -(-len(fitting) // _MOST_RUNS)
-    together = register_tracks(source, [track.points for track, _ in fitting[::every]]) if is_wanted else None
-    std_m = np.array([track.std_m for track, _ in fitting])
-    shared = share_shift([found for _, found in fitting], together, std_m)
-    return {track.run_id: given for (track, _), given in zip(fitting, shared, strict=True)}
 
 
 def _register(run: StoredRun, source: MapFile, projection: Projection, config: SampleConfig) -> _Track:
@@ -144,9 +113,7 @@ def _register(run: StoredRun, source: MapFile, projection: Projection, config: S
     xy_m, height_m = projection.forward(lonlat), height_m[certain]
     is_on = source.grid.contains(xy_m)
     track_std_m = float(np.median(std_m[certain][is_on])) if is_on.any() else float("nan")
-    found = register_tracks(source, [(xy_m, height_m)])
-    (thin,) = thin_tracks([(xy_m[is_on], height_m[is_on])])
-    return _Track(run.run_id, thin, found, expected_m, track_std_m)
+    return _Track(run.run_id, register_track(source, xy_m, height_m), expected_m, track_std_m)
 
 
 def _describe_scale(scale: HeightScale, run_id: str, source: MapFile) -> str:

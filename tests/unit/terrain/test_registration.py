@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from map_worlds import ArrayMap, LeveledMap
 
-from tcpipe.terrain.registration import register_tracks
+from tcpipe.terrain import registration
 from tcpipe.terrain.target_grid import MapGrid
 
 SIDE, PITCH_M = 1000, 0.1
@@ -25,7 +25,7 @@ def site(ground=rolling, noise_m=0.01, factors=(1,), seed=0):
 
 
 def register_track(source, xy_m, height_m):
-    return register_tracks(source, [(xy_m, height_m)])
+    return registration.register_track(source, xy_m, height_m)
 
 
 def drive(count=6000, seed=1):

@@ -147,41 +147,6 @@ def test_a_shift_that_is_not_known_well_enough_is_not_applied(tmp_path, shift_m,
     assert found.card.maps[0].registration[0].applied_std_m is None
 
 
-def build_repeated(directory, shifts_m):
-    """Build a dataset of drives over the same ground, the last shorter than the others."""
-    store = open_world(directory)
-    for number, shift_m in enumerate(shifts_m):
-        xy = np.add(winding()[: 1200 if number == len(shifts_m) - 1 else None], (0.0, 0.1 * number))
-        start, end = lanes([4.0 * number - 6.0], -10.0, 10.0)
-        track = track_at(xy, np.add(xy, shift_m), std_m=0.01, seed=number)
-        add_run(store, f"r{number}", segments(f"r{number}", start, end, start_ns=number * 10**12), track=track)
-    recipe = Recipe(sample=SampleConfig(align=True, max_position_std_m=0.08))
-    return build_dataset(directory / "out", store=store.root, recipe=recipe)
-
-
-def test_a_short_run_takes_the_shift_of_repeated_drives_and_alone_does_not(tmp_path):
-    shared = build_repeated(tmp_path / "shared", [SHIFT_M] * 4)
-    entries = {of.run_id: of for of in shared.card.maps[0].registration}
-    error_m = np.subtract([of.shift_xy_m for of in entries.values()], SHIFT_M)
-    assert np.abs(error_m).max() < 2.0 * min(of.applied_std_m for of in entries.values())
-    assert {of.subject.name for of in select_findings(shared.findings, "map-aligned")} == {"r0", "r1", "r2", "r3"}
-    alone = build_repeated(tmp_path / "alone", [SHIFT_M])
-    assert select_findings(alone.findings, "map-not-aligned")
-
-
-def test_runs_with_another_base_station_are_named_and_keep_their_own_shift(tmp_path):
-    other_m = np.add(SHIFT_M, (0.6, 0.0))
-    result = build_repeated(tmp_path, [SHIFT_M, SHIFT_M, other_m, SHIFT_M])
-    (odd,) = select_findings(result.findings, "map-shifts-differ")
-    assert (odd.subject, odd.severity) == (Subject("run", "r2"), "warning")
-    assert odd.numbers["difference_m"] == pytest.approx(0.6, abs=0.1)
-    entries = {of.run_id: of for of in result.card.maps[0].registration}
-    assert entries["r2"].shift_xy_m == pytest.approx(other_m, abs=0.1)
-    assert entries["r0"].shift_xy_m == pytest.approx(SHIFT_M, abs=0.1)
-    (refused,) = select_findings(result.findings, "map-not-aligned")
-    assert refused.subject.name == "r3"
-
-
 @pytest.mark.parametrize(
     ("geoid_m", "reason"),
     [
