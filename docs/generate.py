@@ -67,7 +67,7 @@ def _cli() -> str:
     return "\n".join(parts)
 
 
-_COMMON = "`tcpipe COMMAND --help` prints more, and the range of each number. `Also:` lists which of these options a command has.\n"
+_COMMON = "`tcpipe COMMAND --help` prints more, which of these options a command has, and the range of each number.\n"
 
 
 def _shared_options(contexts: Sequence[click.Context]) -> dict[str, str]:
@@ -93,7 +93,7 @@ def _format_options(context: click.Context, options: Mapping[str, str]) -> str:
 
 
 def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
-    """Return a command's section: its help, with the options that it shares named only."""
+    """Return a command's section: usage, first paragraph, exit codes and the options that only it has."""
     formatter, command = context.make_formatter(), context.command
     command.format_usage(context, formatter)
     first, *more = inspect.cleandoc(command.help or "").split("\n\n")
@@ -102,14 +102,10 @@ def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
         with formatter.indentation():
             formatter.write_text(" ".join(paragraph.split()))
     records = _option_records(context)
-    also = [names for names, text in records if shared.get(names) == text]
     if own := [record for record in records if record not in shared.items()]:
         with formatter.section("Options"):
             formatter.write_dl(own)
-    long_names = [
-        next(word for word in names.split() if word.startswith("--")) for names in also if "--help" not in names
-    ]
-    body = formatter.getvalue().rstrip() + (f"\n\nAlso: {', '.join(long_names)}" if long_names else "")
+    body = formatter.getvalue().rstrip()
     body = body.replace(" [OPTIONS]", "", 1)
     return f"## tcpipe {context.info_name}\n\n```\n{body}\n```\n"
 
@@ -180,7 +176,7 @@ def _table(table: TableSchema, before: Sequence[TableSchema]) -> str:
 def _column_rows(columns: Sequence[Column]) -> str:
     """Return a list of columns; nothing of none."""
     rows = [
-        f"- {', '.join(f'`{c.name}`' for c in group)} {_describe_type(group)}: {_join_texts(group)}\n"
+        f"- {', '.join(f'`{c.name}`' for c in group)} {_describe_type(group)}: {_join_texts(group).replace('standard deviation', 'σ')}\n"
         for group in _group_columns(columns)
     ]
     return "".join(("\n", *rows)) if rows else ""
@@ -256,9 +252,9 @@ _TROUBLESHOOTING = """# Findings: troubleshooting
 What tcpipe reports about logs, maps, runs and datasets. Each line of a report ends with a code in brackets, as `[no-gnss]`; search this
 page for the code, or for words such as dropout, lever arm, time offset, drift, multipath, no power (more in parentheses).
 
-An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. Data are kept
-unless the line states corrected, inflated (larger σ), excluded (the sensor or run) or rejected (the measurement). `tcpipe ingest`
-ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect RUN` lists all
+An **error** makes the labels that it affects not usable, a **warning** usable with care; the rest are notes, which change no verdict.
+Data are kept unless the line states corrected, inflated (larger σ), excluded (the sensor or run) or rejected (the measurement).
+`tcpipe ingest` ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect RUN` lists all
 findings of a run with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints;
 of a suspect sensor it also prints the line that excludes it by name. Thresholds: [catalogue.toml](../../tcpipe/tables/catalogue.toml).
 """
@@ -282,19 +278,21 @@ _EXCLUSION = "To exclude it by name"
 
 
 def _finding(code: str, entry: Entry) -> str:
-    more: list[str] = [entry.severity, *([entry.action] if entry.action != "kept" else [])]
+    more: list[str] = [entry.severity] if entry.severity != "note" else []
+    more += [entry.action] if entry.action != "kept" else []
     more += [f"affects {', '.join(entry.affects)}"] if entry.affects else []
     more += [f"quality bit `{entry.flag}`"] if entry.flag else []
     more += ["problem"] if entry.is_problem else []
     lines = [f"### {entry.title} `[{code}]`\n"]
-    lines += [f"*{', '.join(more)}.* {_sentence(entry.cause)}\n"]
+    kind = f"*{', '.join(more)}.* " if more else ""
+    lines += [f"{kind}{_sentence(entry.cause)}\n"]
     remedies = [
         *([_sentence(entry.advice)] if entry.advice else []),
         *(f"{text}: …" for text in entry.remedies.values() if text != _EXCLUSION),
     ]
     lines += [f"**Remedy:** {' '.join(remedies)}\n"] if remedies else []
     above = "\n".join(lines).lower()
-    words = [word for word in entry.words if word.lower() not in above]
+    words = [word for word in entry.words if word.lower() not in above] if entry.severity != "note" else []
     lines += [f"({', '.join(words)})\n"] if words else []
     return "\n".join(lines)
 
@@ -314,7 +312,7 @@ def _recipe() -> str:
             parts.append(f"\n## {content}\n\n{' '.join(texts)}\n\n")
         elif found := re.match(r"(\w+) =(?: (?! )(.*?))?(?:  # (.*))?$", content):
             name, default, values = found.groups()
-            values = f" ({values.removeprefix('one of ')})" if values and values != _USUAL_RANGE else ""
+            values = f" ({values.removeprefix('one of ')})" if values and values.startswith("one of") else ""
             value = f" = `{default}`" if default else ""
             parts.append(f"- `{name}`{value}{values}: {' '.join(texts)}\n")
         elif content:
@@ -324,9 +322,8 @@ def _recipe() -> str:
     return "".join(parts)
 
 
-_USUAL_RANGE = "from 1e-06 to 1000"
-_RECIPE = f"""The recipe is `tcpipe.toml`, a configuration file in TOML. `tcpipe init` writes every key with its default, commented out.
-Names end in the unit; numbers without a range: {_USUAL_RANGE}. Reasons: [decisions](../explanation/rulings.md).
+_RECIPE = """The recipe is `tcpipe.toml`, a configuration file in TOML. `tcpipe init` writes every key with default and range.
+Names end in the unit. Reasons: [decisions](../explanation/rulings.md).
 """
 
 
