@@ -63,6 +63,14 @@ def test_the_pages_stay_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 800
 
 
+def test_each_answer_has_a_command_and_at_most_120_words() -> None:
+    _, *answers = (ROOT / "docs/how-to/questions.md").read_text(encoding="utf-8").split("\n## ")
+    assert len(answers) >= 14
+    for answer in answers:
+        assert re.search(r"^(\$|>>>) ", answer, re.MULTILINE), answer
+        assert len(re.sub(_FENCE, "", answer).split()) <= 120, answer
+
+
 def test_the_changelog_of_versions_before_2_has_at_most_60_lines() -> None:
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert len(text[text.index("## 1.0.0") :].splitlines()) <= 60
