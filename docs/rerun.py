@@ -5,7 +5,7 @@
 Blocks fenced as ``console`` hold commands after ``$ ``, blocks fenced as ``pycon`` Python after ``>>> ``; the rest of such a block is
 output and is replaced. A block fenced as ``toml`` that begins with ``# tcpipe.toml`` is added to that file. Each page runs in a directory
 of its own below ~: the NAME of its line ``mkdir NAME && cd NAME``, or what the page is called. A page that goes on from another, by
-``../NAME/``, finds that one followed. ``$DATA`` is the directory of third-party files (TCPIPE_TEST_DATA).
+``../NAME/``, finds that one followed; ``../docs/`` is this directory. ``$DATA`` is the directory of third-party files (TCPIPE_TEST_DATA).
 tests/end_to_end/test_docs.py runs the pages the same way and compares, numbers aside.
 """
 
@@ -40,6 +40,8 @@ def rerun(page: Path, directory: Path) -> str:
     own = _HOME.search(text)
     home = directory / (own[1] if own else page.stem)
     home.mkdir()
+    if not (link := directory / "docs").exists():
+        link.symlink_to(_DOCS)
 
     def block(found: re.Match[str]) -> str:
         kind, body = found[1], found[2]
