@@ -2,7 +2,7 @@
 
     python benchmarks/scale.py hours DIRECTORY [HOURS] [JOBS] [SCENARIO]   write that many hours of logs, and ingest them by one call
     python benchmarks/scale.py memory LOG [LOG ...]              the most memory that ingesting each log takes, and its CPU
-    python benchmarks/scale.py paper                             the second table of docs/internals/performance.md, from the first
+    python benchmarks/scale.py paper                             what follows from the table of docs/internals/performance.md
 
 One simulated drive of twelve minutes (or that of another scenario) is repeated, each time later, every measurement with noise of its own.
 CPU is that of the process and its workers, memory the largest of the calling process at any time.
@@ -185,14 +185,12 @@ def on_paper(of: Mapping[str, float]) -> list[tuple[str, str, str]]:
     ]
 
 
-def write_page(page: Path) -> None:
-    """Write the last table of the page anew, from the figures in its first."""
-    text = page.read_text()
-    of = {name: float(value.replace(",", "")) for name, value in re.findall(r"(?m)^\| `(\w+)` \| ([\d.,]+) \|", text)}
-    head = "| step | at 100,000 hours and 10⁹ samples | one machine ends |\n|---|---|---|\n"
-    rows = "".join(f"| {' | '.join(row)} |\n" for row in on_paper(of))
-    before, _, after = text.partition(head)
-    page.write_text(before + head + rows + re.sub(r"\A(\|.*\n)*", "", after))
+def print_extrapolation(page: Path) -> None:
+    """Print what follows from the figures in the first table of the page."""
+    found = re.findall(r"(?m)^\| `(\w+)` \| ([\d.,]+) \|", page.read_text())
+    print(f"{'step':<34} {'at 100,000 hours and 10⁹ samples':<36} one machine ends")
+    for step, size, end in on_paper({name: float(value.replace(",", "")) for name, value in found}):
+        print(f"{step:<34} {size:<36} {end}")
 
 
 def main(what: str, arguments: Sequence[str]) -> None:
@@ -201,7 +199,7 @@ def main(what: str, arguments: Sequence[str]) -> None:
     elif what == "memory":
         print_memory(arguments)
     else:
-        write_page(Path(__file__).parents[1] / "docs" / "internals" / "performance.md")
+        print_extrapolation(Path(__file__).parents[1] / "docs" / "internals" / "performance.md")
 
 
 if __name__ == "__main__":
