@@ -30,11 +30,9 @@ _CHANGES = {0.0: 0.7, 0.1: 0.15, 0.3: 0.15}
 _RISE_M, _TURN_RAD = 0.1, 0.3
 """Rise and turn that cost about as much as a metre."""
 _FREEDOM = 20.0
-"""Metres that the prior of s² counts as."""
+"""Weight of the prior of s² [metres]."""
 _PLACE_SHARE, _PLACE_M = 0.2, 30.0
 """Share of the variance of errors that metres within a distance have in common [1], and that distance [m]; held-out samples show less."""
-_UPPER_END = (1.0 + COVERAGE) / 2.0
-"""Probability below the upper end of an interval."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +98,9 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
     spread, spread_there = errors.compute_std(*known.ground), errors.compute_std(*there.ground)
     design, design_there = _make_design(known, spread, *usual), _make_design(there, spread_there, *usual)
     residual, apart_m = known.measured - known.predicted, np.abs(known.distance_m[:, None] - known.distance_m)
-    likeness = _find_neighbour(errors) ** apart_m + _PLACE_SHARE * np.exp(-apart_m / _PLACE_M)
+    at = int(np.searchsorted(errors.lag_m, 1.0, side="right")) - 1
+    neighbour = float(np.clip(errors.correlation[at] - errors.correlation[-1], 0.0, 0.95))  # beyond that of a run
+    likeness = neighbour**apart_m + _PLACE_SHARE * np.exp(-apart_m / _PLACE_M)
     factor = cho_factor(spread[:, None] * (likeness + 1e-9 * np.eye(len(residual))) * spread, lower=True)
     solved = cho_solve(factor, np.column_stack([design, residual]))
     gram, cross, square = design.T @ solved[:, :-1], design.T @ solved[:, -1], float(residual @ solved[:, -1])
@@ -123,7 +123,7 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
     weights /= weights.sum()
     mean, variance = _mix(weights, np.array(values), np.array(variances))
     total, total_variance = _mix(weights, np.array(values).sum(axis=1), np.array(totals))
-    wider = float(stdtrit(freedom, _UPPER_END)) / NORMAL_HALF_WIDTH
+    wider = float(stdtrit(freedom, (1.0 + COVERAGE) / 2.0)) / NORMAL_HALF_WIDTH
     low, high = (end * wider * np.sqrt(variance) for end in (errors.low, errors.high))
     std = wider * float(np.sqrt(total_variance))
     common_std = errors.common_share * float(np.abs(mean).sum())
@@ -133,14 +133,9 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
 def _make_design(metres: Metres, spread: Floats, per_metre: float, per_second: float) -> Floats:
     """Return the design matrix X, shape (N, 5)."""
     as_metres = np.column_stack([metres.rise_m / _RISE_M, np.abs(metres.turn_rad) / _TURN_RAD])
-    idle = per_second * metres.duration_s
-    return np.column_stack([spread, metres.predicted, idle, per_metre * np.nan_to_num(as_metres)])
-
-
-def _find_neighbour(errors: Errors) -> float:
-    """Return the correlation of neighbours beyond that of their run."""
-    at = int(np.searchsorted(errors.lag_m, 1.0, side="right")) - 1
-    return float(np.clip(errors.correlation[at] - errors.correlation[-1], 0.0, 0.95))
+    return np.column_stack(
+        [spread, metres.predicted, per_second * metres.duration_s, per_metre * np.nan_to_num(as_metres)]
+    )
 
 
 def _mix(weights: Floats, values: Floats, variances: Floats) -> tuple[Floats, Floats]:
