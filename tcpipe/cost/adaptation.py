@@ -132,10 +132,8 @@ def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
 
 def _make_design(metres: Metres, spread: Floats, per_metre: float, per_second: float) -> Floats:
     """Return the design matrix X, shape (N, 5)."""
-    as_metres = np.column_stack([metres.rise_m / _RISE_M, np.abs(metres.turn_rad) / _TURN_RAD])
-    return np.column_stack(
-        [spread, metres.predicted, per_second * metres.duration_s, per_metre * np.nan_to_num(as_metres)]
-    )
+    as_metres = np.nan_to_num(np.column_stack([metres.rise_m / _RISE_M, np.abs(metres.turn_rad) / _TURN_RAD]))
+    return np.column_stack([spread, metres.predicted, per_second * metres.duration_s, per_metre * as_metres])
 
 
 def _mix(weights: Floats, values: Floats, variances: Floats) -> tuple[Floats, Floats]:
