@@ -39,17 +39,20 @@ Floats = NDArray[np.float64]
 
 PIXEL_M = 0.25
 RANGES = {"slope_rad": (-1.5, 1.5), "cross_slope_rad": (-1.5, 1.5), "relief_m": (0.0, 9.0)}
-RECOVERED = 0.2
-"""Share of negative work that comes back [1], as fits to drives of the Husky give; of work that all comes back no path could save any."""
+GRADE_NEWTON, RECOVERED = 700.0, 0.2
+"""Weight over the drive's efficiency [N], 50 kg at 0.7, and share of negative work that comes back [1]."""
 
 
 class Robot(PhysicsModel):
-    """The model of the tests, for a robot that recovers little downhill."""
+    """The model of the tests with the weight of a Husky, which recovers little downhill."""
 
     def predict(self, patches, extra_features=None):  # type: ignore[no-untyped-def]
         """Return power [W] and velocity [m/s]."""
         power, velocity = super().predict(patches, extra_features).T
-        work = power - 40.0
+        height = patches[..., self.channels.index("height")]
+        along = (np.arange(height.shape[1]) + 0.5) / height.shape[1] - 0.5
+        slope = (height.mean(axis=1) * along).sum(axis=1) / (along**2).sum()
+        work = power - 40.0 + velocity * (GRADE_NEWTON - 300.0) * slope
         return np.stack([40.0 + np.where(work > 0.0, work, RECOVERED * work), velocity], axis=1)
 
 
