@@ -72,6 +72,7 @@ SMALLEST = {
     "label_accuracy": Smallest("--scenario tiny", rf"odometer +[+-]?{NUMBER}%"),
     "load_dataset": Smallest("{out} 300", rf"epoch from disk, zstd: {NUMBER} x memmap"),
     "many_runs": Smallest("{out} 3", rf"build-dataset, cold +{NUMBER} s wall"),
+    "nav2_path": Smallest("40 1", rf"straight lines on the Nav2 map: -?{NUMBER} % more energy"),
     "path_coverage": Smallest("--train 2 --metres 60 --further 1 --models 1", rf"energy +1 m: +{NUMBER} %"),
     "peers": Smallest(
         "--seeds 1 --length 40 --outage 10 --only white", rf"white +pyins( +{NUMBER}){{3}}", package="pyins"
