@@ -1,4 +1,4 @@
-"""What the simulated robot can do, and what it costs: speed limits, slip, rolling resistance, grade, battery, and what its wheels meet.
+"""The abilities and costs of the simulated robot: speed limits, slip, rolling resistance, grade, battery, and what its wheels meet.
 
 The plant is deliberately plain, but every effect that a label should carry is in it: the terrain slows a robot that is commanded at full
 speed, rolling resistance depends on the class (and on what no map shows), grade costs and gives back, turning scrubs, the battery sags.

@@ -271,7 +271,7 @@ _DT_S = STEP_NS * 1e-9
 _BRAKE_BEFORE_M = 0.5
 _SMALL_TURN_RAD = 1e-6
 _DIGGING_RESISTANCE = 0.3
-"""Of wheels that turn while the robot is stuck."""
+"""Rolling resistance of wheels that turn while the robot is stuck [1]."""
 
 
 @dataclass(frozen=True, slots=True)

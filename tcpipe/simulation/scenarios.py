@@ -1,6 +1,6 @@
-"""What `tcpipe simulate` can make: a world, drives over it, their sensors and faults, and how the rasters are cut.
+"""Scenarios of `tcpipe simulate`: a world, drives over it, their sensors and faults, and how the rasters are cut.
 
-The paper's site is made as far as it can be told from the paper: its numbers stand in ``paper_site.toml``, each with where it comes from.
+The paper's site follows the paper as far as this describes it: ``paper_site.toml`` has its numbers, each with its source.
 """
 
 from __future__ import annotations

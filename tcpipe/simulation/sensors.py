@@ -1,6 +1,6 @@
-"""The simulated sensors: what each would have said of the truth, and when the recorder heard it.
+"""The simulated sensors: what each would have measured of the truth, and when the recorder received it.
 
-A sensor samples at its own rate and phase. Its reading holds the time of measurement as the header tells it, the time of recording, and
+A sensor samples at its own rate and phase. Its reading contains the time of measurement in the header, the time of recording, and
 columns in SI units in the sensor's own frame. Each sensor and each fault draws from a random stream of its own, named by a string.
 """
 
@@ -77,7 +77,7 @@ class Faults:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What one sensor said: one row a message."""
+    """Messages of one sensor, one a row."""
 
     stamp_ns: NDArray[np.int64]
     log_time_ns: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""What really happened: the exact motion and power of a drive, at every step of the simulation, and the true cost of a metre."""
+"""The truth: the exact motion and power of a drive, at every step of the simulation, and the true cost of a metre."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _STEP_M = 10.0
 
 @dataclass(frozen=True)
 class Site:
-    """A rectangle of a projected CRS, and how high the geoid lies above the ellipsoid there.
+    """A rectangle of a projected CRS, and the height of the geoid over the ellipsoid there.
 
     A map metre is no ground metre, and grid north is not north: both follow from pyproj's projection by differences, without any formula
     of the pipeline, so that the truth is independent of what it judges.
@@ -153,7 +153,7 @@ def state(waves: Sequence[Wave], u: Float, v: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class SurfaceEffect:
-    """What the states do to one class of ground, where they are 1; where they are -1 the opposite."""
+    """Effects of the states on one class of ground where they are 1; where they are -1, the opposite."""
 
     wet_shade: float = 0.0  # brightness taken away, as a fraction
     wet_resistance: float = 0.0  # rolling resistance added, as a fraction; so with cover
@@ -302,7 +302,7 @@ class World:
     resistance: tuple[Wave, ...] = field(default=())
     """Ripples of the rolling resistance that no map shows, as a fraction."""
     surface: Surface | None = field(default=None, metadata=ABSENT)
-    """What the ground of a class is like from metre to metre; None: everywhere the same."""
+    """Variation of the ground of a class from metre to metre; None: everywhere the same."""
     sun: tuple[float, float, float] | None = field(default=None, metadata=ABSENT)
     """Unit vector east, north, up to the sun that the orthophoto was taken in; None: under an even sky."""
 
