@@ -1,8 +1,8 @@
-"""Judge the estimator on public logs by sensors that are withheld from it.
+"""Judge the estimator on public logs by fixes that are withheld from it.
 
     python benchmarks/withheld.py [LOGS] [--only NAME] [--log LOG ...]
 
-For each log `tcpipe audit` withholds fixes, wheels and camera in windows of 10, 30 and 60 s; see `tcpipe/pipeline/audit.py`. One row a log
+For each log `tcpipe audit` withholds fixes in windows of 10, 30 and 60 s; see `tcpipe/pipeline/audit.py`. One row a log
 shows the fixes: windows, median error, 95 % error and σ [m], and the share of errors inside 1σ and 2σ. Pooled figures follow, one value a
 second of every window, and the mean of the logs' shares: wanted are 92 % of withheld fixes inside 2σ. Logs without fixes show the length of
 the track over that of their own odometry: wanted is 1 to within 2 %. Husky logs are audited again without GNSS, and without GNSS and IMU.
@@ -157,7 +157,7 @@ def list_cases(logs: Path, data: Path) -> Iterator[Case]:
 class Half:
     """What the logs of one half showed."""
 
-    comparisons: dict[tuple[str, float, float], list[Comparison]] = field(default_factory=lambda: defaultdict(list))
+    comparisons: dict[float, list[Comparison]] = field(default_factory=lambda: defaultdict(list))
     ratios: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     cpu_s: float = 0.0
     failed: int = 0
@@ -184,28 +184,22 @@ def row_of(comparisons: list[Comparison]) -> str:
 
 
 def print_log(case: Case, found: WithheldComparisons, cpu_s: float) -> None:
-    fixes = [
-        f"| {of.window_s:.0f} s {row_of([of])} " for of in found.comparisons if of.chord_s is None
-    ]  # fmt: skip
+    fixes = [f"| {of.window_s:.0f} s {row_of([of])} " for of in found.comparisons]
     ratios = [f"| track/{role} {ratio:.4f} " for role, ratio in found.length_ratios.items()]
-    skipped = "" if fixes or ratios else "| " + "; ".join(f"{role}, {reason}" for role, reason in found.skipped)
+    skipped = "" if fixes or ratios else "| " + "; ".join(found.skipped)
     print(f"{case.name:<44} {case.half:<8} {cpu_s:6.1f} s {''.join([*fixes, *ratios])}{skipped}", flush=True)
 
 
 def print_pooled(name: str, half: Half) -> None:
     print(f"\n{name}: {half.cpu_s:.1f} CPU-s, {half.failed} logs failed")
-    print(f"{'':34} logs windows  error    95 %   sigma   <1s  <2s  <2s, mean of logs  straight line: error, 95 %")
-    kinds = {
-        f"{role} {window_s:.0f} s" + (f", chord {chord_s:.0f} s" if chord_s else ""): comparisons
-        for (role, window_s, chord_s), comparisons in sorted(half.comparisons.items())
-    }
-    if fixes := [of for comparisons in kinds.values() for of in comparisons if of.chord_s is None]:
+    print(f"{'':34} logs windows  error    95 %   sigma   <1s  <2s  <2s, mean of logs")
+    kinds = {f"gnss {window_s:.0f} s": comparisons for window_s, comparisons in sorted(half.comparisons.items())}
+    if fixes := [of for comparisons in kinds.values() for of in comparisons]:
         kinds["all fixes"] = fixes
     for kind, comparisons in kinds.items():
         of = score_comparisons(comparisons)
         by_log = np.mean([score_comparisons([each]).within_2_sigma for each in comparisons])
-        line = "" if of.straight_median_m is None else f"   {of.straight_median_m:.3f} {of.straight_p95_m:.3f}"
-        print(f"{kind:<34} {len(comparisons):4d} {row_of(comparisons)}  {by_log:4.0%} {line}  {of.calibration}")
+        print(f"{kind:<34} {len(comparisons):4d} {row_of(comparisons)}  {by_log:4.0%}  {of.calibration}")
     for variant, values in sorted(half.ratios.items()):
         within = np.mean(np.abs(np.array(values) - 1.0) < 0.02)
         low, high = min(values), max(values)
@@ -239,7 +233,7 @@ def main() -> None:
             cpu_s = time.process_time() - begun_s
             half.cpu_s += cpu_s
             for of in found.comparisons:
-                half.comparisons[of.role, of.window_s, of.chord_s or 0.0].append(of)
+                half.comparisons[of.window_s].append(of)
             source, _, variant = case.name.partition(",")
             for role, ratio in found.length_ratios.items():
                 half.ratios[f"track/{role}, {source.partition('/')[0]}{variant}"].append(ratio)

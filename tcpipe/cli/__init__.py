@@ -36,7 +36,7 @@ _COMMANDS = {
     "inspect": ("inspect", "List the contents of a log, map, dataset or store"),
     "preflight": ("log_commands", "Check a short test recording before a campaign"),
     "ingest": ("log_commands", "Convert logs to labelled 1 m segments"),
-    "audit": ("log_commands", "Judge a track by sensors withheld from it"),
+    "audit": ("log_commands", "Judge a track by fixes withheld from it"),
     "status": ("log_commands", "List the state and problems of every log"),
     "acknowledge": ("log_commands", "Do not report known problems again"),
     "prune": ("log_commands", "Remove what a store no longer needs"),

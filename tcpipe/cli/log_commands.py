@@ -295,9 +295,8 @@ def audit(
 ) -> int:
     """Judge the uncertainty of LOG, or of RUN or RUN/RECIPE of the store, by measurements that its track does not use.
 
-    tcpipe fuses the run without its fixes in windows of 10, 30 and 60 s and prints the error of the predicted antenna, its σ, the share
-    of errors inside 1σ and 2σ, and the error of a straight line. The same for wheels and camera, by the distance in 1 and 4 s.
-    Without fixes: length of the track over that of each odometry.
+    tcpipe fuses the run without its fixes in windows of 10, 30 and 60 s and prints the error of the predicted antenna, its σ, and the
+    share of errors inside 1σ and 2σ. Without fixes: length of the track over that of each odometry.
     """
     from tcpipe.pipeline.audit import audit as judge
 

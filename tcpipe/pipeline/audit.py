@@ -1,8 +1,8 @@
-"""Judge the uncertainty of a run: withhold a sensor in windows, fuse the rest, and compare the track with what was withheld."""
+"""Judge the uncertainty of a run: withhold fixes in windows, fuse the rest, and compare the track with them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,17 +14,15 @@ from tcpipe.errors import FusionError, UsageError, clean_lines
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.fusion.measurements import DOPPLER, FIXES, GNSS, PAUSE_NS, VISUAL, WHEELS, BodyVelocities, Positions
+from tcpipe.fusion.measurements import DOPPLER, FIXES, PAUSE_NS, Positions
+from tcpipe.fusion.signals import compute_seconds, integrate_signal
 from tcpipe.fusion.withheld import (
-    CHORDS_S,
     END_S,
     LEAST_WINDOW_M,
     Comparison,
     TrackRows,
     WithheldScore,
-    compare_chords,
     compare_fixes,
-    integrate_between,
     place_windows,
     score_comparisons,
 )
@@ -42,16 +40,15 @@ from tcpipe.tables.levels import Streams, Track
 Ints = NDArray[np.int64]
 
 WINDOWS_S = (10.0, 30.0, 60.0)
-"""Lengths of the windows without a sensor [s]."""
+"""Lengths of the windows without fixes [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class WithheldComparisons:
-    """Every comparison of a run; why others are missing; without fixes the track's length over that of each odometry."""
+    """Comparisons of a run by length of the windows; why others are missing; without fixes the track's length over each odometry's."""
 
     comparisons: tuple[Comparison, ...]
-    skipped: tuple[tuple[str, str], ...]
-    """Role and reason."""
+    skipped: tuple[str, ...]
     length_ratios: dict[str, float]
 
 
@@ -69,9 +66,9 @@ class _Run:
 
 
 def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> WithheldComparisons:
-    """Withhold fixes, wheels and camera in turn in windows of each length, and compare them with the track of the rest.
+    """Withhold fixes in windows of each length, and compare them with the track of the rest.
 
-    All windows of a length are withheld together, so that a sensor and a length cost one fusion.
+    All windows of a length are withheld together, so that a length costs one fusion.
 
     Raises `FusionError`: no sensor measures motion.
     """
@@ -79,70 +76,61 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
     if not sections:
         raise FusionError(f"{run_id}: no sensor measures motion")
     run = _Run(run_id, streams, config, max(sections, key=lambda section: section.driven_m))
-    comparisons, skipped = list[Comparison](), list[tuple[str, str]]()
-    motion = [role for role in (GNSS, WHEELS, VISUAL) if role in run.section.measurements.sensors()]
-    if len(motion) == 1:
-        skipped.append((motion[0], "no other sensor measures motion"))
-    for role in motion if len(motion) > 1 else ():
-        stamp_ns = run.section.measurements.sensors()[role].stamp_ns
-        span_s = float(stamp_ns[-1] - stamp_ns[0]) * 1e-9
-        for length_s in WINDOWS_S:
-            windows_ns = int(stamp_ns[0]) + np.round(place_windows(span_s, length_s) * 1e9).astype(np.int64)
-            if not windows_ns.size:
-                needed_s = length_s + 2.0 * END_S
-                skipped.append((role, f"{length_s:.0f} s: covers {span_s:.0f} s, {needed_s:.0f} s are needed"))
-                break
-            try:
-                comparisons += _compare_role(run, role, length_s, windows_ns)
-            except FusionError as error:
-                skipped.append((role, f"{length_s:.0f} s: {error.problems[0]}"))
-    ratios = {} if GNSS in motion else _compare_lengths(run)
-    return WithheldComparisons(tuple(comparisons), tuple(skipped), ratios)
+    comparisons, skipped = list[Comparison](), list[str]()
+    gnss = run.section.measurements.gnss
+    if gnss is None:
+        return WithheldComparisons((), ("without fixes",), _compare_lengths(run))
+    if not run.section.measurements.odometries():
+        skipped.append("no other sensor measures motion")
+    span_s = float(gnss.stamp_ns[-1] - gnss.stamp_ns[0]) * 1e-9
+    for length_s in WINDOWS_S if not skipped else ():
+        windows_ns = int(gnss.stamp_ns[0]) + np.round(place_windows(span_s, length_s) * 1e9).astype(np.int64)
+        if not windows_ns.size:
+            skipped.append(f"{length_s:.0f} s: covers {span_s:.0f} s, {length_s + 2.0 * END_S:.0f} s are needed")
+            break
+        try:
+            comparisons.append(_compare_fixes(run, gnss, windows_ns))
+        except FusionError as error:
+            skipped.append(f"{length_s:.0f} s: {error.problems[0]}")
+    return WithheldComparisons(tuple(comparisons), tuple(skipped), {})
 
 
 _OTHER_ARM = {"lever-arm-unknown", "lever-arm-contradicted"}
 """Findings of an antenna that is elsewhere than stated."""
 
 
-def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> Iterator[Comparison]:
-    step(f"fusing without {role} for {len(windows_ns)} x {length_s:.0f} s")
-    track = run.fuse(withhold(run.streams, role, run.section.clock_epoch, windows_ns))
+def _compare_fixes(run: _Run, gnss: Positions, windows_ns: Ints) -> Comparison:
+    step(f"fusing without {len(windows_ns)} x {(windows_ns[0, 1] - windows_ns[0, 0]) * 1e-9:.0f} s of fixes")
+    track = run.fuse(withhold(run.streams, run.section.clock_epoch, windows_ns))
     facts = track.info.report.facts
-    if role == GNSS and facts.fuse is not None and not {*FIXES}.intersection(facts.fuse.sensors):
+    if facts.fuse is not None and not {*FIXES}.intersection(facts.fuse.sensors):
         raise FusionError("tcpipe excludes the other fixes of the run")
     rows = _select_rows(track, run.section)
     moving = np.array([rows.measure_length_m(*window) >= LEAST_WINDOW_M for window in windows_ns])
     if not moving.any():
         raise FusionError("the rest has no track in the windows, or the robot is stationary there")
-    numbers, sensor = np.flatnonzero(moving), run.section.measurements.sensors()[role]
-    if isinstance(sensor, Positions):
-        datum = track.info.datum
-        if datum is None or run.section.datum_deg_m is None:
-            raise FusionError("the track of the rest has only local coordinates")
-        places = geodetic_from_enu(sensor.position_enu_m, datum_deg_m=run.section.datum_deg_m)
-        moved = enu_from_geodetic(*places, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m))
-        sensor = replace(sensor, position_enu_m=moved)
-        arm_m, arm_std_m = np.asarray(run.streams.sensors[find_fixes_role(run.streams)].xyz_m), np.zeros(3)
-        if facts.fuse and any(finding.code in _OTHER_ARM for finding in track.info.report.findings):
-            arm = facts.fuse.longest.parameters["antenna"]
-            arm_m, arm_std_m = arm_m + arm.value, np.asarray(arm.std)
-        yield compare_fixes(sensor, rows, windows_ns, numbers, arm_m=arm_m, arm_std_m=arm_std_m, window_s=length_s)
-    elif isinstance(sensor, BodyVelocities):
-        for chord_s in CHORDS_S:
-            found = compare_chords(role, sensor, rows, windows_ns, numbers, chord_s=chord_s, window_s=length_s)
-            if found.window.size:
-                yield found
+    datum = track.info.datum
+    if datum is None or run.section.datum_deg_m is None:
+        raise FusionError("the track of the rest has only local coordinates")
+    places = geodetic_from_enu(gnss.position_enu_m, datum_deg_m=run.section.datum_deg_m)
+    moved = enu_from_geodetic(*places, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m))
+    arm_m, arm_std_m = np.asarray(run.streams.sensors[find_fixes_role(run.streams)].xyz_m), np.zeros(3)
+    if facts.fuse and any(finding.code in _OTHER_ARM for finding in track.info.report.findings):
+        arm = facts.fuse.longest.parameters["antenna"]
+        arm_m, arm_std_m = arm_m + arm.value, np.asarray(arm.std)
+    fixes, numbers = replace(gnss, position_enu_m=moved), np.flatnonzero(moving)
+    return compare_fixes(fixes, rows, windows_ns, numbers, arm_m=arm_m, arm_std_m=arm_std_m)
 
 
-def withhold(streams: Streams, role: str, epoch: int, windows_ns: Ints) -> Streams:
-    """Return the streams without a sensor in windows [ns], shape (N, 2), of a clock epoch; a receiver loses its velocity with its fixes."""
+def withhold(streams: Streams, epoch: int, windows_ns: Ints) -> Streams:
+    """Return the streams without fixes and velocities of the receiver in windows [ns], shape (N, 2), of a clock epoch."""
 
     def keep(table: pa.Table) -> pa.Table:
         stamp_ns = to_integers(table, "stamp_ns")
         inside = np.searchsorted(windows_ns[:, 0], stamp_ns, "right") > np.searchsorted(windows_ns[:, 1], stamp_ns)
         return table.filter(number_column(~(inside & (to_integers(table, "clock_epoch") == epoch))))
 
-    without = (*FIXES, DOPPLER) if role == GNSS else (role,)
+    without = (*FIXES, DOPPLER)
     return replace(
         streams, tables={name: keep(table) if name in without else table for name, table in streams.tables.items()}
     )
@@ -153,11 +141,13 @@ def _compare_lengths(run: _Run) -> dict[str, float]:
     rows = _select_rows(run.fuse(run.streams), run.section)
     if rows.stamp_ns.size == 0:
         return {}
-    length_m = rows.measure_length_m(int(rows.stamp_ns[0]), int(rows.stamp_ns[-1]) + 1)
+    ends_ns = rows.stamp_ns[[0, -1]]
+    length_m = rows.measure_length_m(int(ends_ns[0]), int(ends_ns[1]) + 1)
     ratios = {}
     for role, odometry in run.section.measurements.odometries().items():
-        speed = np.abs(odometry.velocity_mps[:, 0])
-        odometer_m = float(integrate_between(odometry.stamp_ns, speed, rows.stamp_ns[:1], rows.stamp_ns[-1:])[0])
+        zero_ns, speed = int(odometry.stamp_ns[0]), np.abs(odometry.velocity_mps[:, :1])
+        way_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero_ns), speed, compute_seconds(ends_ns, zero_ns))
+        odometer_m = float(way_m[1, 0] - way_m[0, 0])
         if odometer_m > LEAST_WINDOW_M:
             ratios[role] = length_m / odometer_m
     return ratios
@@ -170,20 +160,19 @@ def _select_rows(track: Track, section: Section) -> TrackRows:
     return TrackRows(to_integers(table, "stamp_ns"), read_float_columns(table), track.info.rate_hz)
 
 
-_HEADER = (
-    "withheld", "window", "chord", "windows", "values", "error", "95 %", "σ", "≤ 1σ", "≤ 2σ", "line", "95 %", "",
-)  # fmt: skip
+_HEADER = ("window", "windows", "values", "error", "95 %", "σ", "≤ 1σ", "≤ 2σ", "")
 
 
 @dataclass(frozen=True, slots=True)
 class Audit:
-    """How well a run's track predicts what was withheld from it."""
+    """How well a run's track predicts fixes that were withheld from it."""
 
     run: str
     robot: str
     scores: tuple[WithheldScore, ...]
+    """By length of the windows without fixes."""
     skipped: tuple[str, ...]
-    """What could not be withheld, and why."""
+    """Windows that could not be withheld, and why."""
     length_ratios: Mapping[str, float]
     """Without fixes: length of the track over the distance of each odometry, by role."""
 
@@ -192,7 +181,7 @@ class Audit:
         lines = [f"{self.run}: robot {self.robot}"]
         if self.scores:
             lines += [
-                "m: median and 95 % of the errors, their median σ; shares inside 1σ and 2σ; errors of a straight line between the ends",
+                "m: median and 95 % of the errors of withheld fixes, their median σ; shares inside 1σ and 2σ",
                 "",
             ]
             rows = [_HEADER, *map(_make_row, self.scores)]
@@ -206,15 +195,11 @@ class Audit:
 
 
 def _make_row(score: WithheldScore) -> tuple[str, ...]:
-    line = (score.straight_median_m, score.straight_p95_m)
     return (
-        score.role,
         f"{score.window_s:.0f} s",
-        "" if score.chord_s is None else f"{score.chord_s:.0f} s",
         *(str(count) for count in (score.windows, score.compared)),
         *(f"{value:.3f}" for value in (score.median_error_m, score.p95_error_m, score.median_std_m)),
         *(f"{share:.0%}" for share in (score.within_1_sigma, score.within_2_sigma)),
-        *("" if value is None else f"{value:.3f}" for value in line),
         score.calibration,
     )
 
@@ -227,7 +212,7 @@ def audit(
     message_definitions: Path | None = None,
     store: Path | str = "tcpipe-store",
 ) -> Audit:
-    """Withhold fixes, wheels and camera in windows, fuse the rest, and score the track by what was withheld.
+    """Withhold fixes in windows, fuse the rest, and score the track by what was withheld.
 
     Raises `UsageError`: the run is too short, or has no sensor beside the one that would be withheld; `LogError`, `RecipeError`,
     `StoreError`, `FusionError`: it cannot be read or fused.
@@ -241,13 +226,11 @@ def audit(
     name = format_path(run)
     streams, config = read_audited(run, recipe, robot=robot, message_definitions=message_definitions, store=store)
     found = compare_withheld(streams, config, run_id=name)
-    fixes = {GNSS: find_fixes_role(streams)}
-    skipped = tuple(f"{fixes.get(role, role)}, {reason}" for role, reason in found.skipped)
+    skipped = tuple(f"{find_fixes_role(streams)}, {reason}" for reason in found.skipped)
     if not found.comparisons and not found.length_ratios:
         raise UsageError(f"{name}: nothing can be withheld and compared", *skipped)
-    scores = (score_comparisons([each]) for each in found.comparisons)
-    named = tuple(replace(score, role=fixes.get(score.role, score.role)) for score in scores)
-    return Audit(name, streams.robot, named, skipped, found.length_ratios)
+    scores = tuple(score_comparisons([each]) for each in found.comparisons)
+    return Audit(name, streams.robot, scores, skipped, found.length_ratios)
 
 
 def read_audited(
