@@ -85,12 +85,10 @@ def reckon_dead(m: Measurements, start_ns: int, bias_radps: float) -> DeadReckon
     return DeadReckoning(stamp_s, forward_mps, yaw_s[order], rate[order])
 
 
-_GRID_S = 0.5  # grid of the course
-_WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
-_MIN_BASELINE_STD = 3.0  # σ of fixes that a baseline needs
-_MOVING_M = 0.3  # shorter baselines show no course
-_MIN_MOVING_SHARE = 0.3  # share of usable baselines before longer ones
-_STEP_S = 1e-6  # step between two rates
+_GRID_S, _WINDOWS_S, _STEP_S = 0.5, (1.0, 2.0, 4.0, 8.0, 16.0), 1e-6
+"""Grid of the course, baselines that are tried, and step between two rates [s]."""
+_MOVING_M, _MIN_BASELINE_STD, _MIN_MOVING_SHARE = 0.3, 3.0, 0.3
+"""Least baseline that shows a course [m], and in σ of fixes; share of usable baselines below which longer ones are tried [1] (rulings)."""
 
 
 def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_ns: int) -> tuple[Floats, Floats]:

@@ -32,19 +32,18 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _Number = TypeVar("_Number", np.float64, np.complex128)
 
-STEP_S = 0.05
-"""Between the rows of a grid."""
-KNOT_S = 60.0
-"""Between knots of the heading's drift."""
-_UP_S = 10.0  # averaging of the specific force [s]
-_SLOWEST_IMU_NS = 100_000_000  # slower units do not show turns
-_ALIGN_S = 10.0  # windows of the alignment
-_PITCH_KNOT_S = 240.0  # the same of pitch, whose error is an accelerometer's bias
-_ROUNDS = 8
-_ARM_STD_M, _OFFSET_STD_S, _PITCH_STD_RAD = 0.3, 0.3, 0.1  # of what the alignment takes out
-_MIN_SCALE = 0.2  # an odometry of less shows another motion
-_MIN_MOVE_M = 0.2  # shorter windows show no heading
-_FEWEST = 4  # windows that show a heading
+STEP_S, KNOT_S, _PITCH_KNOT_S = 0.05, 60.0, 240.0
+"""Steps of the grid of times; between knots of the drift of heading; of pitch, whose error is an accelerometer's bias [s]."""
+_UP_S, _ALIGN_S = 10.0, 10.0
+"""Time over which the specific force is averaged, and length of the windows of the alignment [s]."""
+_SLOWEST_IMU_NS = 100_000_000
+"""Longest period of an IMU that shows turns [ns]."""
+_ROUNDS, _FEWEST = 8, 4
+"""Rounds of weighted least squares, and samples or windows that show a turn or a heading [1] (rulings)."""
+_ARM_STD_M, _OFFSET_STD_S, _PITCH_STD_RAD = 0.3, 0.3, 0.1
+"""Prior σ of what the alignment takes out: lever arm [m], time offset [s], pitch [rad]."""
+_MIN_SCALE, _MIN_MOVE_M = 0.2, 0.2
+"""Least scale of an odometry that shows the same motion [1], and least length of a window that shows a heading [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +112,7 @@ def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Att
     bias = np.median(np.einsum("nji,nj->ni", matrix_from_quat(quat), turn), axis=0)
     quat = _multiply_increments((rate[:-1] - bias) * STEP_S)
     up = _find_up(quat, force)
-    rotation = _level(up) @ matrix_from_quat(quat)
+    rotation = compute_levelling_rotations(up) @ matrix_from_quat(quat)
     yaw = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
     return Attitude(time_s, rotation, yaw, rate - bias, IMU, stamp_ns, is_level=True)
 
@@ -154,10 +153,11 @@ def _find_up(quat: Floats, force: Floats) -> Floats:
     return np.asarray(up / np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9))
 
 
-def _level(up: Floats) -> Floats:
-    """Return the smallest rotations (n, 3, 3) that turn each direction to z."""
+def compute_levelling_rotations(up: Floats) -> Floats:
+    """Return the smallest rotations (n, 3, 3) that turn unit vectors (n, 3) to +z."""
     x, y, z = up.T
-    return matrix_from_quat(normalize(np.stack((y, -x, 0.0 * x, np.maximum(1.0 + z, 1e-3)), -1)))
+    is_down = 1.0 + z < 1e-9
+    return matrix_from_quat(normalize(np.stack((y + is_down, -x, 0.0 * x, 1.0 + z), -1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,18 +206,17 @@ def align_tracks(
 ) -> dict[str, Track]:
     """Return the tracks of odometries in the frame of the fixes; none where the fixes show no motion.
 
-    Heading, arm and time offset are fitted to the odometry that follows the fixes best, and then hold for the others.
+    Heading, arm and time offset of the odometry that follows the fixes best also hold for the others; each has its own scale.
     """
     alignment = _Alignment(gnss, attitude, zero_ns)
     fits = {role: fit for role, forward in forward_mps.items() if (fit := alignment.fit(forward)) is not None}
     if not fits:
         return {}
     best = min(fits.values(), key=lambda fit: fit.noise_m)
-    scales = {role: alignment.find_scale(forward_mps[role], best) for role in fits}
     return {
-        role: alignment.make_track(forward_mps[role], replace(best, scale=scale))
-        for role, scale in scales.items()
-        if scale > _MIN_SCALE
+        role: alignment.make_track(forward_mps[role], replace(best, scale=fit.scale))
+        for role, fit in fits.items()
+        if fit.scale > _MIN_SCALE
     }
 
 
@@ -327,15 +326,6 @@ class _Alignment:
                 noise,
             )
         return fit
-
-    def find_scale(self, forward: Floats, fit: _Fit) -> float:
-        """Return by how much the fixes move farther along an odometry's track, the median; negative where it goes the other way."""
-        velocity, arm = self._horizontal(forward, replace(fit, scale=1.0))
-        moved, fix = self._difference(integrate_grid(velocity)), self._moved_m[:, 0] + 1j * self._moved_m[:, 1]
-        length = np.abs(moved)
-        moving = length > max(0.3 * float(np.median(length)), _MIN_MOVE_M)
-        ratio = ((fix - self._difference(arm)) * np.conj(moved)).real[moving] / length[moving] ** 2
-        return float(np.median(ratio)) if ratio.size else 0.0
 
     def make_track(self, forward: Floats, fit: _Fit) -> Track:
         """Return the aligned track, its pitch corrected by the fixes' heights."""

@@ -13,7 +13,6 @@ from tcpipe.fusion.checks.clock_offsets import (
     find_other_clocks,
     shift_sensors,
 )
-from tcpipe.fusion.checks.motions import NEAR_S
 from tcpipe.fusion.checks.sanity import SensorExclusion
 from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
 from tcpipe.fusion.measurements import DOPPLER, GNSS
@@ -133,7 +132,6 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
     return make_finding(
         "time-offset",
         subject,
-        severity="note" if role == DOPPLER else None,
         action="corrected",
         names=names,
         remedies=_state_offset(role, offset, streams),
@@ -146,8 +144,7 @@ def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Rem
     """Return what corrects the stamps of a sensor; a receiver's own velocity has the clock of its fixes."""
     given_s = streams.report.facts.time_offset_s.get(role, 0.0)
     correction_s = round(given_s - offset.offset_s, 3)
-    is_far = abs(offset.offset_s) > NEAR_S and role == GNSS and DOPPLER in streams.tables
-    roles = (role, DOPPLER) if is_far else (role,)
+    roles = (role, DOPPLER) if role == GNSS and DOPPLER in streams.tables else (role,)
     return suggest("correct", {"read.time_offset_s": dict.fromkeys(roles, correction_s)})
 
 

@@ -1,7 +1,7 @@
 """Time offsets between the stamps of a run's sensors, by what they measure of the same motion.
 
 Small offsets are states of the estimator, and steps of a clock are hypotheses of it. Larger offsets are found before fusion. Two signals of
-one motion are shifted against each other until one explains most of the other (`motions`): yaw rates, speeds, accelerations, velocities.
+one motion are shifted against each other until one explains most of the other (`motions`): yaw rates and speeds.
 They are compared only where the robot turns or changes its speed: on a straight there is nothing to compare but what the controller
 corrects, and that leads the body. The course of the fixes is not compared with the gyroscope: an antenna that sits ahead of the turning
 point by l leads the body's course by l / v, 0.1 s for 10 cm.
@@ -27,7 +27,6 @@ from tcpipe.fusion.checks.motions import (
     SMOOTH_S,
     Lag,
     average,
-    compute_acceleration,
     compute_fix_velocity,
     compute_lag_sums,
     differentiate_course,
@@ -39,7 +38,6 @@ from tcpipe.fusion.checks.motions import (
     iterate_windows_ns,
     prepare_coarse_signals,
     resample_imu,
-    resample_signal,
     resample_twist,
 )
 from tcpipe.fusion.measurements import (
@@ -59,19 +57,19 @@ ROLES = (IMU, WHEELS, VISUAL, GNSS)
 """Sensors in the order in which their clocks are taken for the right one: a gyroscope has the least to compute."""
 NOTED_S = 0.05
 """Least time offset that a person should act on [s]."""
-_MAX_STD_S, _MAX_STD_OF_LARGE_S, _MIN_SIGMAS_OF_LARGE = 0.02, 0.06, 10.0
-"""Largest σ of an offset that is known [s], and of one that is many σ from 0: the mean of a clock that steps has a larger one."""
+_MAX_STD_S, _MAX_RELATIVE_STD = 0.02, 0.1
+"""Largest σ of an offset that is known [s]; and relative to it [1]: the mean of a clock that steps has a larger one."""
 _MIN_EXPLAINED = 0.25
 """Least share of a signal's variance that another one on the right clock explains: noise and slip are the rest."""
-_LEAST_STD_S, _LEAST_BY_FORCE_S, _COARSE_STD_S = 1e-3, 0.02, 0.1
-"""Standard deviations of offsets [s]: at least; by an accelerometer, which slopes act on; by the coarse search."""
+_LEAST_STD_S, _COARSE_STD_S = 1e-3, 0.1
+"""Standard deviations of offsets [s]: at least; by the coarse search."""
 _WINDOW_NS, _MIN_WINDOWS = (40_000_000_000, 600_000_000_000), 3
 """Least and most time in which a clock does not drift [ns], a fifth of the run in between, and how many of these show a drift."""
 _DRIFT_STD = 1e-3  # standard deviation of a clock's drift before the run shows it [1]: ten times that of a quartz
 _LIVELY, _NEAR_ROWS = 0.1, round(2.0 / GRID_S)
 """Yaw rate [rad/s] or change of speed [m/s] of a manoeuvre, and rows around one that are compared: 2 s."""
 
-YAW_RATE, SPEED, ACCELERATION, VELOCITY = "yaw rate", "speed", "acceleration", "velocity"
+YAW_RATE, SPEED = "yaw rate", "speed"
 
 Floats = NDArray[np.float64]
 
@@ -100,8 +98,8 @@ def find_middle_ns(m: Measurements) -> tuple[int, float]:
 def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, ClockOffset]:
     """Return by role the time offset of each sensor from the largest group of sensors that share a clock.
 
-    Offsets that the fine search cannot find are noted. Returns {} if there are none, unless ``always``. Sensors whose offset is unknown
-    are missing.
+    Offsets that the fine search cannot find are noted. Without such an offset it returns {}, unless ``always``. Sensors whose offset is
+    unknown are missing.
     """
     coarse = find_coarse_offsets(m)
     if not always and not any(offset.noted for offset in coarse.values()):
@@ -134,7 +132,11 @@ def find_coarse_offsets(m: Measurements) -> dict[str, ClockOffset]:
 
 
 def shift_sensors(m: Measurements, offsets: Mapping[str, ClockOffset], middle_ns: int) -> Measurements:
-    """Return measurements whose stamps are without the offsets of their sensors, and the drifts about ``middle_ns``."""
+    """Return measurements whose stamps are without the offsets of their sensors, and the drifts about ``middle_ns``.
+
+    A receiver's velocity has the clock of its fixes.
+    """
+    offsets = {**offsets, **({DOPPLER: offsets[GNSS]} if GNSS in offsets else {})}
     off = {role: sensor for role, sensor in m.sensors().items() if role in offsets}
     stamps = {role: shift_stamps(sensor.stamp_ns, offsets[role], middle_ns) for role, sensor in off.items()}
     return m.replace_sensors({role: replace(sensor, stamp_ns=stamps[role]) for role, sensor in off.items()})
@@ -151,25 +153,23 @@ def _compute_lateness(offset: ClockOffset, from_middle_s: Floats | float) -> Flo
 
 def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float, Plane]]) -> list[ClockPair]:
     """Return two sensors compared: in each window if three show one offset and drift, else over the run."""
-    lags = [(at_s, lag) for at_s, sums in windows if (lag := estimate_lag([sums])) and lag.explained >= _MIN_EXPLAINED]
-    at_s, offset_s, std_s = np.reshape([(at_s, lag.offset_s, lag.std_s) for at_s, lag in lags], (-1, 3)).T
-    known = std_s <= _MAX_STD_OF_LARGE_S
-    if known.sum() >= _MIN_WINDOWS:
-        line = np.polyfit(at_s[known], offset_s[known], 1, w=1.0 / np.maximum(std_s[known], _LEAST_STD_S))
-        misfit_s = np.abs(offset_s - np.polyval(line, at_s))[known]
-        if (misfit_s <= np.maximum(MIN_SIGMAS * std_s[known], NOTED_S)).all():
-            found = [
-                (at_s, make_pair(late, against, by, lag)) for at_s, lag in lags if lag.std_s <= _MAX_STD_OF_LARGE_S
-            ]
-            return [replace(pair, determined=True, from_middle_s=at_s) for at_s, pair in found]
+    lags = [(at_s, lag) for at_s, sums in windows if (lag := estimate_lag([sums]))]
+    pairs = [replace(make_pair(late, against, by, lag), from_middle_s=at_s) for at_s, lag in lags]
+    known = [pair for pair in pairs if pair.explained >= _MIN_EXPLAINED and pair.std_s <= NOTED_S]
+    if len(known) >= _MIN_WINDOWS:
+        at_s, offset_s, std_s = np.array([(pair.from_middle_s, pair.offset_s, pair.std_s) for pair in known]).T
+        line = np.polyfit(at_s, offset_s, 1, w=1.0 / np.maximum(std_s, _LEAST_STD_S))
+        misfit_s = np.abs(offset_s - np.polyval(line, at_s))
+        if (misfit_s <= np.maximum(MIN_SIGMAS * std_s, NOTED_S)).all():
+            return [replace(pair, determined=True) for pair in known]
     whole = estimate_lag([sums for _, sums in windows])
     return [make_pair(late, against, by, whole)] if whole and np.isfinite(whole.std_s) else []
 
 
 def make_pair(late: str, against: str, by: str, lag: Lag) -> ClockPair:
     """Return two sensors compared; a lag is determined where its error is small or it is surely not zero."""
-    is_large = lag.std_s <= _MAX_STD_OF_LARGE_S and abs(lag.offset_s) > _MIN_SIGMAS_OF_LARGE * lag.std_s
-    determined = (lag.std_s <= _MAX_STD_S or is_large) and lag.explained >= _MIN_EXPLAINED
+    is_sharp = lag.std_s <= max(_MAX_STD_S, _MAX_RELATIVE_STD * abs(lag.offset_s))
+    determined = is_sharp and lag.explained >= _MIN_EXPLAINED
     return ClockPair(late, against, by, lag.offset_s, lag.std_s, lag.explained, determined)
 
 
@@ -177,25 +177,19 @@ def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tupl
     """Yield what can be compared: whose stamps against whose, by what, target and regressor on the grid, shape (M,)."""
     twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
     if m.imu is not None:
-        turn, force, _ = resample_imu(m.imu, at_ns)
+        turn = average(resample_imu(m.imu, at_ns)[0], SMOOTH_S)
         for role, twist in twists.items():
             turning = average(twist[:, 1], SMOOTH_S)
-            yield role, IMU, YAW_RATE, _select_near(turning, turning), average(turn, SMOOTH_S)
-            if m.imu.accelerometer_usable:
-                changes = find_quick_part(average(twist[:, 0], SMOOTH_S))
-                yield role, IMU, ACCELERATION, _select_near(changes, compute_acceleration(twist)), force
+            yield role, IMU, YAW_RATE, _select_near(turning, turning), turn
     if len(twists) == 2:
         target, seen = (find_quick_part(average(np.abs(twists[role][:, 0]), SMOOTH_S)) for role in (VISUAL, WHEELS))
         yield VISUAL, WHEELS, SPEED, _select_near(seen, target), seen
     if m.gnss is not None:
-        velocity = compute_fix_velocity(m.gnss, at_ns)
+        velocity = find_quick_part(np.abs(compute_fix_velocity(m.gnss, at_ns)))
         for role, twist in twists.items():
             speed = _compute_antenna_speed(twist, m.gnss.lever_arm_m)
             seen = find_quick_part(average(average(speed, FIXES_S), FIXES_S))
-            yield GNSS, role, SPEED, _select_near(seen, find_quick_part(np.abs(velocity))), seen
-        if m.doppler is not None:
-            own = resample_signal(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2], at_ns) @ np.array([1.0, 1j])
-            yield DOPPLER, GNSS, VELOCITY, average(average(own, FIXES_S), FIXES_S), velocity
+            yield GNSS, role, SPEED, _select_near(seen, velocity), seen
 
 
 def _select_near(lively: Floats, values: Signal) -> Signal:
@@ -222,7 +216,6 @@ def solve_offsets(
     """Return each sensor's offset from the clock that most sensors share, by weighted least squares over the pairs that are determined.
 
     Clocks within ``near_s`` are one. Where as many agree with either of two, that of the first of ``roles`` is taken for the right one.
-    The receiver's velocity has no say: it has the clock of the fixes, and no label needs it.
     """
     known = [pair for pair in pairs if pair.determined]
     solved = {
@@ -232,28 +225,23 @@ def solve_offsets(
         return ClockFacts(clock_epoch, "", tuple(pairs), {})
     # Sensors near a reference agree with it, however certain: a reference clock with a large σ proves no offset.
     agreeing = {
-        role: {role}
-        | {each for each, of in offsets.items() if abs(of.offset_s) <= near_s and not of.drift_ppm} - {DOPPLER}
+        role: {role} | {each for each, of in offsets.items() if abs(of.offset_s) <= near_s and not of.drift_ppm}
         for role, offsets in solved.items()
     }
     reference = max(solved, key=lambda role: len(agreeing[role]))  # the first of equals
     offsets = {reference: ClockOffset(0.0, 0.0, noted=False)} | solved[reference]
-    blamed = {role: role == DOPPLER or _is_blamed(role, agreeing[reference], offsets, known) for role in offsets}
+    blamed = {role: _is_blamed(role, agreeing[reference], offsets, known) for role in offsets}
     decided = {role: replace(offset, blamed=blamed[role]) for role, offset in solved[reference].items()}
     return ClockFacts(clock_epoch, reference, tuple(pairs), decided)
-
-
-def _get_std_s(pair: ClockPair) -> float:
-    """Return the standard deviation of a pair beside those of others [s]."""
-    return max(pair.std_s, _LEAST_BY_FORCE_S if pair.by == ACCELERATION else _LEAST_STD_S)
 
 
 def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) -> dict[str, ClockOffset]:
     """Return offset and drift of each sensor that pairs connect to the reference; no drift unless windows determine it."""
     connected = _find_connected(reference, pairs)
     used = [pair for pair in pairs if pair.late in connected]
-    free = [role for role in (*ROLES, DOPPLER) if role in connected and role != reference]
-    std, at_s = np.array([_get_std_s(pair) for pair in used]), np.array([pair.from_middle_s for pair in used])
+    free = [role for role in ROLES if role in connected and role != reference]
+    std = np.array([max(pair.std_s, _LEAST_STD_S) for pair in used])
+    at_s = np.array([pair.from_middle_s for pair in used])
     signs = np.array([[(role == p.late) - float(role == p.against) for role in free] for p in used]) / std[:, None]
     prior = np.hstack((np.zeros((len(free), len(free))), np.eye(len(free)) / _DRIFT_STD))
     design = np.vstack((np.hstack((signs, signs * at_s[:, None])), prior))
@@ -291,17 +279,10 @@ def _find_connected(role: str, pairs: Collection[ClockPair]) -> set[str]:
 def _is_blamed(
     role: str, agreeing: Collection[str], offsets: Mapping[str, ClockOffset], pairs: Sequence[ClockPair]
 ) -> bool:
-    """Whether two sensors that agree speak against a role by the same kind of motion, and no pair contradicts any of them.
-
-    A yaw rate says nothing of the clock of a speed: a filter may pass the gyroscope's on at once and smooth the wheels'.
-    """
-    if role in agreeing:
-        return False
+    """Return whether two sensors that agree speak against a role, and no pair contradicts any of them."""
     among = [p for p in pairs if {p.late, p.against} <= {role, *agreeing}]
-    if any(abs(_compute_misfit_s(p, offsets)) > max(MIN_SIGMAS * _get_std_s(p), NOTED_S) for p in among):
-        return False
-    kinds = ([p for p in among if (p.by == YAW_RATE) == turning] for turning in (True, False))
-    return any(len(_find_connected(role, of_kind)) > 2 for of_kind in kinds)
+    is_contradicted = any(abs(_compute_misfit_s(p, offsets)) > max(MIN_SIGMAS * p.std_s, NOTED_S) for p in among)
+    return role not in agreeing and not is_contradicted and len(_find_connected(role, among)) > 2
 
 
 def _compare_roughly(m: Measurements) -> Iterator[ClockPair]:

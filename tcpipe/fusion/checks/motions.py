@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS, DeadReckoning
+from tcpipe.fusion.level_motion import compute_levelling_rotations
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import (
     MAX_GAP_NS,
@@ -32,7 +33,6 @@ from tcpipe.fusion.signals import (
     remove_spikes,
     remove_wild_places,
 )
-from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rotation_vector
 
 GRID_S = 0.02
 """Spacing of the grid [s]."""
@@ -43,8 +43,6 @@ FIXES_S = 0.5
 _LONGEST_NS, _STEP_NS = 1800 * 10**9, 300 * 10**9  # the window that is judged, and from one candidate to the next
 SMOOTH_S, _ACCELERATION_S, _SLOW_S = 0.1, 0.3, 4.0
 """Times over which speeds and yaw rates are averaged, and accelerations; slower changes are also slip and slopes [s]."""
-_MIN_STEADINESS = 0.4
-"""Least length of the mean direction of a force that shows up [1]: that of a unit whose gravity is removed changes."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -154,33 +152,16 @@ def _differentiate(values: Signal, subtract: Callable[[Signal, Signal], Signal])
     return rates
 
 
-def find_up_axis(force: Floats) -> Floats:
-    """Return the mean direction of the specific force (N, 3), shape (3,); z where the force has no steady direction."""
-    size = np.linalg.norm(force, axis=1, keepdims=True)
-    directions = np.divide(force, size, out=np.zeros_like(force), where=size > 0)
-    mean: Floats = directions.sum(axis=0) / max(len(force), 1)
-    length = np.linalg.norm(mean)
-    return mean / length if length > _MIN_STEADINESS else np.array([0.0, 0.0, 1.0])
-
-
-def compute_levelling_rotation(up: Floats) -> Floats:
-    """Return the smallest rotation, as a matrix (3, 3), that turns a unit vector to +z."""
-    cross = np.cross(up, [0.0, 0.0, 1.0])
-    size = float(np.linalg.norm(cross))
-    if size < 1e-9:
-        return np.eye(3) if up[2] > 0 else np.diag([1.0, -1.0, -1.0])
-    matrix: Floats = matrix_from_quat(quat_from_rotation_vector(cross / size * np.arctan2(size, up[2])))
-    return matrix
-
-
 def resample_imu(imu: InertialMeasurements, at_ns: Ints) -> tuple[Floats, Plane, Floats]:
     """Return yaw rate and quick horizontal specific force (forward, i times left), shape (M,) each, and the rotation (3, 3) that levels.
 
-    The unit is levelled by the mean direction of its force.
+    The unit is levelled by the mean direction of its force where this contains gravity.
     """
     signals = (imu.angular_velocity_radps, imu.specific_force_mps2)
     rate, force = (resample_signal(imu.stamp_ns, values, at_ns) for values in signals)
-    level = compute_levelling_rotation(find_up_axis(force[np.isfinite(force).all(1)]))
+    gravity = np.nan_to_num(force).sum(0) if imu.accelerometer_usable else np.zeros(3)
+    up = gravity / np.linalg.norm(gravity) if gravity.any() else np.array([0.0, 0.0, 1.0])
+    level = compute_levelling_rotations(up[None])[0]
     horizontal = average(force @ level[:2].T @ np.array([1.0, 1j]), _ACCELERATION_S)
     return rate @ level[2], find_quick_part(horizontal), level
 
@@ -376,19 +357,18 @@ _MANOEUVRES = (0.15, 0.1)  # least size of a signal that varies [m/s], [rad/s]
 _MIN_ROWS = 450  # rows of the least overlap, 90 s
 _MIN_SCORE, _MIN_EXPLAINED = 18.0, 0.16
 """Least log-likelihood ratio of the best lag, 6 σ: noise reaches 4 σ in 3,000 lags; and least share explained of one signal."""
-_WINDOW = 50  # rows in which two lags are compared, 10 s
-_APART, _MIN_RIVAL = 15, 0.25
-"""Rows between separate peaks, 3 s, and least log-likelihood ratio of a row at a rival peak over that at the best [1]."""
+_APART, _MAX_RIVAL = 15, 0.5
+"""Rows between separate peaks, 3 s, and largest log-likelihood ratio of a row at another peak over that at the best [1]."""
 
 
 def prepare_coarse_signals(speed_mps: Floats, turn_radps: Floats) -> Floats:
-    """Return speed and turn rate for `find_coarse_lag`, shape (2, N): rows in whole windows, averaged, less the mean around each.
+    """Return speed and turn rate for `find_coarse_lag`, shape (2, N): averaged, less the mean around each.
 
     NaN throughout if a signal does not vary.
     """
     width, prepared = round(COARSE_S / GRID_S), []
     for values, least in zip((speed_mps, turn_radps), _MANOEUVRES, strict=True):
-        rows = values[: values.size // (width * _WINDOW) * width * _WINDOW].reshape(-1, width).mean(1)
+        rows = values[: values.size // width * width].reshape(-1, width).mean(1)
         smooth = np.where(np.isfinite(rows), compute_moving_mean(rows, _SMOOTH, least=0.0), np.nan)
         quick = smooth - compute_moving_mean(smooth, _SLOW, least=0.0)
         varies = (np.abs(quick) > least).sum() > 2 * _SMOOTH + 1
@@ -412,32 +392,7 @@ def find_coarse_lag(late: Floats, against: Floats) -> float | None:
     best = int(np.argmax(score))
     if best in {0, 2 * _MOST} or score[best] < _MIN_SCORE or explained[:, best].max() < _MIN_EXPLAINED:
         return None
-    if abs(best - _MOST) * COARSE_S > NEAR_S:
-        peaks = _find_peaks(height)
-        peaks = peaks[(np.abs(peaks - best) > _APART) & (height[peaks] > _MIN_RIVAL * height[best])]
-        if any(_is_rival(late, against, best - _MOST, peak - _MOST) for peak in (_MOST, *peaks.tolist())):
-            return None
+    is_rival = (np.abs(np.arange(height.size) - best) > _APART) & (height > _MAX_RIVAL * height[best])
+    if abs(best - _MOST) * COARSE_S > NEAR_S and is_rival.any():
+        return None
     return (best - _MOST + _refine_peak(score, best)) * COARSE_S
-
-
-def _is_rival(late: Floats, against: Floats, best: int, other: int) -> bool:
-    """Return whether a lag [rows] explains the same rows about as well as the best: few windows prefer the best, or some the other."""
-    residuals, of_other = (_compute_residuals(late, against, lag) for lag in (best, other))
-    noise = np.nansum(residuals, axis=1) / np.maximum(np.isfinite(residuals).sum(1), 1)
-    worse = ((of_other - residuals) / np.maximum(noise, 1e-12)[:, None]).reshape(2, -1, _WINDOW)
-    clear = 0.5 * np.maximum(np.isfinite(worse).sum((0, 2)), _WINDOW)
-    total = np.nansum(worse, axis=(0, 2))
-    return bool((total > clear).sum() - 3 * (total < -clear).sum() < 2 * _MIN_SPANS)
-
-
-def _compute_residuals(late: Floats, against: Floats, lag: int) -> Floats:
-    """Return the squares of what the other signals, ``lag`` rows later, leave of the late ones, shape (2, N); NaN where unknown."""
-    moved, size = np.full_like(late, np.nan), late.shape[1]
-    moved[:, max(lag, 0) : max(size + lag, 0)] = against[:, max(-lag, 0) : max(size - lag, 0)]
-    known = np.isfinite(moved) & np.isfinite(late)
-    counts = np.maximum(known.sum(1, keepdims=True), 1)
-    x, y = (
-        np.where(known, each - np.sum(each, axis=1, where=known, keepdims=True) / counts, 0.0) for each in (moved, late)
-    )
-    slope = np.sum(x * y, axis=1, keepdims=True) / np.maximum(np.sum(x * x, axis=1, keepdims=True), 1e-12)
-    return np.where(known, (y - np.maximum(slope, 0.0) * x) ** 2, np.nan)
