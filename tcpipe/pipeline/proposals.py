@@ -246,7 +246,7 @@ _RUN_TEXT = (r"\d+(?=\D*$)", r"\d(?:[\d_.:T-]*\d)?", r"^[^_. -]+(?=[_ -])")
 _TRIAL_NS = 60_000_000_000
 _MAX_REJECTED_SHARE = 0.2
 _SCALE_TOLERANCE = 0.03
-_CONTRADICTIONS = ("unit-suspected", "distance-contradicted", "drives-backwards", "path-unlike")
+_CONTRADICTIONS = ("distance-contradicted", "drives-backwards", "yaw-rate-sign")
 """Findings of the first minute that contradict a table of wheel odometry or of an IMU."""
 _HINTS = {
     "gnss": r"(.*_)?(lat|lon|lng|gps|gnss|alt)\w*",
@@ -552,6 +552,8 @@ def _try_lines(lines: Sequence[ProposedLine], log: Path, reasons: Mapping[str, s
         if finding.code == "measurements-rejected" and blamed == "gnss":  # a minute of fixes is seldom wrong
             is_wrong = finding.numbers["rejected_fraction"] > _MAX_REJECTED_SHARE
             reasons |= {"tables.wheel_odometry": why} if is_wrong else {}
+        elif finding.code == "distance-contradicted" and blamed == "wheel_odometry" and "suspect" not in finding.names:
+            lines = _scale_speed(lines, finding.numbers["distance_ratio"], why)
         elif finding.code in _CONTRADICTIONS and blamed in ("imu", "wheel_odometry"):
             reasons[f"tables.{blamed}"] = why
         elif finding.code == "imu-units":

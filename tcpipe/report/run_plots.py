@@ -416,12 +416,8 @@ def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts, findings: S
 
 
 def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str, float, float, str, str]]:
-    """Yield when sensors disagreed or were rejected: row, start and end [s], colour and text."""
+    """Yield when sensors were rejected: row, start and end [s], colour and text."""
     events = []
-    for part in facts.audit.disagreements if facts.audit else ():
-        role = part.sensor.replace("_", " ")
-        text = f"{role}: distance off by {part.size:.2g} m, {part.expected_std:.2g} expected"
-        events.append((f"{role} disagrees", part.start_ns, part.end_ns, part.clock_epoch, text))
     for stretch in facts.fuse.stretches if facts.fuse else ():
         for opened in stretch.gate_resets:
             role = opened.role.replace("_", " ")

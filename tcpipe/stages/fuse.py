@@ -7,30 +7,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion.checks.audit import is_astray
-from tcpipe.fusion.checks.sanity import SensorExclusion, make_fix_exclusion
-from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, Trajectory
+from tcpipe.fusion.measurements import GNSS
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_clocks import correct_clocks, exclude_other_clocks, find_clocks, find_offsets
 from tcpipe.stages.fuse_findings import (
     add_counts,
     find_fuse_findings,
     find_parameter_findings,
-    make_audit_findings,
     make_fuse_facts,
     rename_role,
 )
 from tcpipe.stages.fuse_inputs import (
     Section,
     drop_implausible_sensors,
-    exclude_sensors,
-    find_span_s,
     prepare_sections,
 )
 from tcpipe.stages.fuse_sections import Fused, find_exclusions, fuse_section, make_rejections_table, merge_findings
@@ -60,14 +54,14 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
     # 1. Streams become sections of measurements: one frame, one set of units, usable variances, without sensors that cannot be right.
     streams, is_local = use_pose_as_fixes(streams)
     sections = exclude_other_clocks(prepare_sections(streams, config), streams)
-    sections = find_clocks(drop_implausible_sensors(sections, streams))
+    sections = correct_clocks(find_clocks(drop_implausible_sensors(sections, streams)), streams)
     # 2. Initial state, filter and smoother of each section.
-    sections, fused, errors = fuse_sections(sections, streams, config, run=run)
+    fused, errors = fuse_sections(sections, streams, config)
     failures = merge_findings(finding for error in errors for finding in error.findings)
     if not fused.found:
         problems = [problem for error in errors for problem in error.problems] or ["no motion to fuse"]
-        nothing = [] if errors else [_find_nothing(streams, sections, run), *find_exclusions(sections)]
-        raise FusionError(*problems, findings=(*failures, *nothing))
+        nothing = [] if errors else [_find_nothing(streams, sections, run)]
+        raise FusionError(*problems, findings=(*failures, *nothing, *find_exclusions(sections)))
     columns = {name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]}
     is_local |= bool(np.isnan(columns["lon_deg"]).all())
     if is_local:
@@ -75,9 +69,8 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
     table = TRACK.table(**columns)
     origin = next((section.datum_deg_m for section in sections if section.datum_deg_m), None)
     datum = None if is_local or origin is None else Datum(*origin, crs=streams.gnss_crs)
-    # 3. Excluded sensors, what the run shows of the others, and where the track contradicts all of them.
+    # 3. Excluded sensors, and what the run shows of the others.
     summary = make_fuse_facts(sections, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
-    audit = make_audit_findings(fused, sections, streams)
     exclusions = find_exclusions(sections)
     findings = (
         *find_fuse_findings(sections, summary, run=run),
@@ -85,14 +78,12 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
         *exclusions,
         *find_parameter_findings(sections, summary, streams),
         *([make_finding("direction-assumed", Subject("role", GNSS))] if fused.is_forward_assumed else []),
-        *audit.findings,
         *find_offsets(sections, streams),
         *sections[0].cuts.values(),
     )
     facts: dict[str, Any] = {
         "fuse": summary,
         "sensor_checks": SensorChecks({finding.subject.name: finding.code for finding in reversed(exclusions)}),
-        "audit": audit.facts,
         "clock_offsets": tuple(section.clocks for section in sections),
     }
     findings, facts = rename_role((findings, facts), GNSS, fixes)
@@ -101,34 +92,24 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
     return Track(table, make_rejections_table(sections, fused.found, fixes), info)
 
 
-def fuse_sections(
-    sections: Sequence[Section], streams: Streams, config: FuseConfig, *, run: Subject
-) -> tuple[list[Section], Fused, list[FusionError]]:
-    """Return the sections as they were fused, their track, and why some have none.
+def fuse_sections(sections: Sequence[Section], streams: Streams, config: FuseConfig) -> tuple[Fused, list[FusionError]]:
+    """Return the track of sections on one clock each, and why some have none.
 
-    A section is fused again without the offset of a clock that its estimate finds to step. Where one section has a place on the earth,
-    those without fixes are skipped.
+    A local frame goes on from the end of the section before. Where one section has a place on the earth, those without fixes are skipped.
     """
-    given, used, tracks, errors = [*sections], correct_clocks(sections, streams), list[Fused](), list[FusionError]()
-    for place in range(len(given)):
+    tracks, errors = list[Fused](), list[FusionError]()
+    for section in sections:
         last = next((track.found[-1] for track in reversed(tracks) if track.found), None)
-        fuse = partial(fuse_recovering, streams=streams, config=config, run=run, last=last)
-        tracks.append(_skip(used[place]))
         try:
-            section, track = fuse(used[place])
-            unsteady = {change.role for facts in track.facts for change in facts.changes if change.kind == "clock"}
-            if unsteady & section.offsets.keys():
-                steady = {role: offset for role, offset in section.clocks.offsets.items() if role not in unsteady}
-                given[place] = replace(given[place], clocks=replace(section.clocks, offsets=steady))
-                section, track = fuse(correct_clocks(given, streams)[place])
-            used[place], tracks[place] = section, track
+            tracks.append(fuse_section(section, streams, config, last))
         except FusionError as error:
             errors.append(error)
-    has_place = any(section.datum_deg_m and track.found for section, track in zip(used, tracks, strict=True))
+            tracks.append(_skip(section))
+    has_place = any(section.datum_deg_m and track.found for section, track in zip(sections, tracks, strict=True))
     fused = Fused()
-    for section, track in zip(used, tracks, strict=True):
+    for section, track in zip(sections, tracks, strict=True):
         fused.append(_skip(section) if has_place and section.datum_deg_m is None else track)
-    return used, fused, errors
+    return fused, errors
 
 
 def _skip(section: Section) -> Fused:
@@ -152,45 +133,3 @@ def _find_nothing(streams: Streams, sections: Sequence[Section], run: Subject) -
     counts = add_counts(sections)
     rows |= {f"{role}_unusable_count": count["invalid"] for role, count in counts.items() if count["invalid"]}
     return make_finding("no-motion", run, **rows)
-
-
-def fuse_recovering(
-    inputs: Section, streams: Streams, config: FuseConfig, *, run: Subject, last: Trajectory | None = None
-) -> tuple[Section, Fused]:
-    """Fuse a section; where the track contradicts every sensor, again without the one that misleads it.
-
-    That is the IMU, which carries the state from tick to tick, if the track recovers without it; else the only sensor without which it
-    does. A single sensor of motion that its own track contradicts is not consistent: there is nothing to fuse without it. A local frame
-    goes on from the end of ``last``.
-
-    Raises `FusionError`: the track contradicts every sensor, whichever is excluded, or the only one.
-    """
-    fused = fuse_section(inputs, streams, config, last)
-    if not is_astray(fused.windows, fused.astray):
-        return inputs, fused
-    roles = sorted(inputs.measurements.sensors())
-    recovered = {}
-    for role in roles:
-        rest = _exclude_misleading(role, inputs, streams)
-        if rest.measurements.gnss is not None or rest.measurements.odometries():
-            tried = fuse_section(rest, streams, config, last)
-            if tried.found and not is_astray(tried.windows, tried.astray):
-                recovered[role] = rest, tried
-    if IMU in recovered:
-        return recovered[IMU]
-    if len(recovered) == 1:
-        return next(iter(recovered.values()))
-    code, subject = "track-contradicts-sensors", run
-    motion = {*roles} - {IMU, DOPPLER}
-    if len(motion) == 1:
-        code, subject = "sensor-contradicts-itself", Subject("role", motion.pop())
-    span_s = find_span_s(*inputs.span_ns, streams)
-    finding = make_finding(code, subject, span_s=span_s, astray_fraction=fused.astray / fused.windows)
-    raise FusionError("the track contradicts every sensor", findings=(finding, *inputs.excluded.values()))
-
-
-def _exclude_misleading(role: str, inputs: Section, streams: Streams) -> Section:
-    odometries = set(inputs.measurements.odometries()).difference({role})
-    code = "misleads-track"
-    exclusion = make_fix_exclusion(code, odometries) if role == GNSS else SensorExclusion(role, code)
-    return exclude_sensors(inputs, [exclusion], streams)

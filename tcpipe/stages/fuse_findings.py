@@ -9,9 +9,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.sanity import compute_command_ratio
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Positions
-from tcpipe.fusion.process import SCALE_STD
 from tcpipe.geometry.rotation import (
     matrix_from_quat,
     multiply,
@@ -23,17 +21,14 @@ from tcpipe.geometry.rotation import (
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robust import MIN_SIGMAS
 from tcpipe.stages.fuse_inputs import Section, exclude_role, state_extrinsics
-from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.facts import (
-    AuditFacts,
     ChangeFacts,
-    Disagreement,
     FuseFacts,
     GateReset,
     ParameterFacts,
     StretchFacts,
 )
-from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
 
 _CERTAIN_YAW_SOURCES = ("course over ground", "pose")
@@ -166,16 +161,8 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
 
 def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
     """Yield what explains contradictions of sensors: what changed, when, and by how much fixes were off."""
-    merged: list[ChangeFacts] = []
     changes = (each for section in facts.stretches for each in section.changes if each.kind in CHANGES)
-    for change in sorted(changes, key=lambda each: (each.role, each.kind, each.start_ns)):
-        before = merged[-1] if merged else change
-        if merged and (before.role, before.kind) == (change.role, change.kind) and change.start_ns <= before.end_ns:
-            end_ns, size = max(before.end_ns, change.end_ns), max(before.size, change.size)
-            merged[-1] = replace(before, end_ns=end_ns, size=size)
-        else:
-            merged.append(change)
-    for change in sorted(merged, key=lambda each: each.start_ns):
+    for change in sorted(changes, key=lambda each: each.start_ns):
         subject = Subject("role", change.role)
         names, span_s = {"change": CHANGES[change.kind].format(change.size)}, _find_span_s(change, first_ns)
         yield make_finding("sensor-changed", subject, span_s=span_s, names=names)
@@ -208,52 +195,18 @@ CHANGES = {
 """Changes in words, with their size."""
 
 
-def _find_span_s(each: StretchFacts | GateReset | ChangeFacts | Disagreement, first_ns: int) -> tuple[float, float]:
+def _find_span_s(each: StretchFacts | GateReset | ChangeFacts, first_ns: int) -> tuple[float, float]:
     return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
 
 
-def make_audit_findings(fused: Fused, inputs: Sequence[Section], streams: Streams) -> StageReport[AuditFacts]:
-    """Return every disagreement, wheels that are faster than any command, and the findings of both."""
-    found = fused.disagreements
-    first_ns = min((section.start_ns for section in fused.facts), default=0)
-    findings = [_find_disagreement(found, first_ns)] if found else []
-    # The scale of the wheels is a constant of the robot: any section may show that it is wrong.
-    ratios = (compute_command_ratio(section.measurements, section.command) for section in inputs)
-    faster = max((ratio for ratio in ratios if ratio is not None), default=None)
-    if faster is not None:
-        scale = round((streams.report.facts.odometry_scale or {}).get(WHEELS, 1.0) / faster, 2)
-        remedies = suggest("state_scale", {"read.odometry_scale": {WHEELS: scale}})
-        remedies += exclude_role("command", "exclude_command")
-        wheels = Subject("role", WHEELS)
-        findings.append(make_finding("faster-than-commanded", wheels, remedies=remedies, speed_ratio=faster))
-    return StageReport(tuple(findings), AuditFacts(tuple(found), () if faster is None else (WHEELS,)))
-
-
-def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
-    """Return the finding of all disagreements: how often, the largest, and when that is."""
-    worst = max(found, key=lambda each: each.size / each.expected_std)
-    return make_finding(
-        "distance-disagrees",
-        Subject("role", worst.sensor),
-        span_s=_find_span_s(worst, first_ns),
-        off_m=worst.size,
-        expected_std_m=worst.expected_std,
-        event_count=len(found),
-        total_s=sum(each.end_ns - each.start_ns for each in found) / 1e9,
-    )
-
-
-_LEAST_ARM_M = 0.1  # what a finding names
-_LEAST_TILT_RAD = 0.0175
-_LEAST_TURN_RAD = 0.05
-_LEAST_SCALE = 0.1
+_LEAST_ARM_M, _LEAST_TILT_RAD, _LEAST_TURN_RAD, _LEAST_SCALE = 0.1, 0.0175, 0.05, 0.1
+"""Least errors that are findings: of a lever arm [m], the tilt of an IMU (1°), the rotation of a pose [rad], a scale [1] (rulings)."""
 
 
 def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams: Streams) -> Iterator[Finding]:
     """Yield where the longest track section shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
     longest = facts.longest
     parameters = longest.parameters
-    scales = {role: scale for section in inputs for role, scale in section.scales.items()}
     arm, tilt = parameters.get("antenna"), parameters.get("mounting of the IMU")
     if arm is not None and GNSS in streams.sensors:
         sensor, turned = streams.sensors[GNSS], parameters.get("mounting of the pose")
@@ -270,9 +223,8 @@ def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams
         yield _find_tilt(tilt, streams.sensors[IMU])
     for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):
         found = parameters.get(name)
-        if role in scales or (found is not None and _is_contradicted(found, _LEAST_SCALE)):
-            value, std = (0.0, SCALE_STD[role]) if found is None else (found.value[0], found.std[0])
-            scale = scales.get(role, 1.0) * (1.0 + value)
+        if found is not None and _is_contradicted(found, _LEAST_SCALE):
+            scale, std = 1.0 + found.value[0], found.std[0]
             stated = (streams.report.facts.odometry_scale or {}).get(role, 1.0)
             remedies = suggest("state", {"read.odometry_scale": {role: round(stated / scale, 4)}})
             yield make_finding("odometry-scale", Subject("role", role), remedies=remedies, scale=scale, scale_std=std)

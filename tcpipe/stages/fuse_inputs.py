@@ -21,7 +21,6 @@ from tcpipe.fusion.checks.sanity import (
     SensorExclusion,
     check_ground_velocity,
     check_sensors,
-    rescale_odometries,
 )
 from tcpipe.fusion.measurements import (
     DOPPLER,
@@ -49,8 +48,8 @@ from tcpipe.tables.levels import Sensor, Streams
 class Section:
     """One clock epoch of a run, or a part of it without a pause of `_PAUSE_NS`, and everything that is decided about its sensors.
 
-    Units, mounting and scale are constants of the robot: a section also has those that sections with a longer drive show. Clocks, frozen
-    sensors and everything else are decided in each section alone.
+    Units and mounting are constants of the robot: a section also has those that sections with a longer drive show. Everything else is
+    decided in each section alone.
 
     Attributes
     ----------
@@ -58,10 +57,8 @@ class Section:
     datum_deg_m : longitude, latitude, height of the local frame's origin; None without fixes.
     prepared : by role, messages that are not used as they are.
     excluded : by role, why a sensor is not fused.
-    scales : by odometry, the scale that was taken out.
     clocks : time offsets of the sensors; ``measurements`` contain them until `tcpipe.stages.fuse_clocks.correct_clocks`.
     cuts : by first stamp [ns] after the clock of all sensors was set forward, the finding.
-    is_base_free : whether no other section shows where base_link is.
     """
 
     clock_epoch: int
@@ -71,10 +68,8 @@ class Section:
     prepared: Mapping[str, Prepared] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     excluded: Mapping[str, Finding] = field(default_factory=dict)
-    scales: Mapping[str, float] = field(default_factory=dict)
     clocks: ClockFacts = field(default_factory=lambda: ClockFacts(0, "", (), {}))
     cuts: Mapping[int, Finding] = field(default_factory=dict)
-    is_base_free: bool = False
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -208,32 +203,23 @@ def drop_implausible_sensors(sections: Sequence[Section], streams: Streams) -> l
     """Return the sections without the sensors that cannot be right.
 
     Sections are judged from the longest drive to the shortest. Each one decides about its own sensors, after it has taken over the
-    constants of the robot that those before it have shown: a few metres show neither the sign of a yaw rate nor a scale.
+    constants of the robot that those before it have shown: a few metres do not show the sign of a yaw rate.
     """
-    stated = {role: sensor.placed_by in _STATED for role, sensor in streams.sensors.items()}
+    is_imu_stated = IMU in streams.sensors and streams.sensors[IMU].placed_by in _STATED
     felt = _compute_median_specific_force(streams)
     judged = list(sections)
     constants: dict[str, SensorExclusion] = {}
-    scales: dict[str, float] = {}
     for place in rank_sections(sections):
-        section = sections[place]
-        roles = section.measurements.sensors()
-        known = {role: scale for role, scale in scales.items() if role in roles}
-        section = replace(section, measurements=rescale_odometries(section.measurements, known))
-        section = exclude_sensors(section, [each for role, each in constants.items() if role in roles], streams)
-        found, own = check_sensors(section.measurements, command=section.command, stated=stated, felt=felt)
-        section = replace(section, measurements=rescale_odometries(section.measurements, own))
+        roles = sections[place].measurements.sensors()
+        section = exclude_sensors(sections[place], [constants[role] for role in constants if role in roles], streams)
+        found = check_sensors(section.measurements, section.command, is_imu_stated=is_imu_stated, felt=felt)
         section = exclude_sensors(section, found.values(), streams)
         doubt = check_ground_velocity(section.measurements)
-        found |= {} if doubt is None else {doubt.role: doubt}
-        section = exclude_sensors(section, [] if doubt is None else [doubt], streams)
-        known |= {role: known.get(role, 1.0) * scale for role, scale in own.items()}
-        judged[place] = replace(section, scales=known)
+        judged[place] = exclude_sensors(section, [] if doubt is None else [doubt], streams)
         constants = {role: each for role, each in found.items() if each.code in CONSTANT_FAULTS} | constants
-        scales = known | scales
     if not any(section.measurements.gnss for section in judged):
         judged = [replace(section, datum_deg_m=None) for section in judged]
-    return _define_base_by_antenna(judged, streams)
+    return [_define_base_by_antenna(section, streams) for section in judged]
 
 
 def exclude_sensors(section: Section, exclusions: Iterable[SensorExclusion], streams: Streams) -> Section:
@@ -241,28 +227,22 @@ def exclude_sensors(section: Section, exclusions: Iterable[SensorExclusion], str
     excluded = {**section.excluded, **{each.role: _find_exclusion(each, section, streams) for each in exclusions}}
     # The receiver's velocity is of the antenna of the fixes.
     gone = dict.fromkeys((*excluded, DOPPLER) if GNSS in excluded else excluded)
-    section = replace(
+    return replace(
         section,
         datum_deg_m=None if GNSS in excluded else section.datum_deg_m,
         measurements=section.measurements.replace_sensors(gone),
         excluded=excluded,
     )
-    return _define_base_by_antenna([section], streams)[0] if section.is_base_free else section
 
 
-def _define_base_by_antenna(sections: Sequence[Section], streams: Streams) -> list[Section]:
-    """Return the sections with an antenna that nothing places exactly at base_link, if no other sensor of motion is fused in any."""
-    alone = [section.measurements.is_antenna_alone or not section.measurements.sensors() for section in sections]
-    based = []
-    for place, section in enumerate(sections):
-        gnss, findings = section.measurements.gnss, section.findings
-        if all(alone) and gnss is not None and streams.sensors[GNSS].placed_by == "assumed":
-            gnss = replace(gnss, lever_arm_std_m=NO_LEVER_ARM)
-            findings = tuple(dict.fromkeys((*findings, make_finding("track-of-antenna", Subject("role", GNSS)))))
-        measurements = section.measurements.replace_sensors({GNSS: gnss})
-        is_base_free = all(alone[:place] + alone[place + 1 :])
-        based.append(replace(section, measurements=measurements, findings=findings, is_base_free=is_base_free))
-    return based
+def _define_base_by_antenna(section: Section, streams: Streams) -> Section:
+    """Return a section with an antenna that nothing places exactly at base_link, if no other sensor of motion is fused."""
+    m = section.measurements
+    if m.gnss is None or not m.is_antenna_alone or streams.sensors[GNSS].placed_by != "assumed":
+        return section
+    found = make_finding("track-of-antenna", Subject("role", GNSS))
+    gnss = replace(m.gnss, lever_arm_std_m=NO_LEVER_ARM)
+    return replace(section, measurements=m.replace_sensors({GNSS: gnss}), findings=(*section.findings, found))
 
 
 def read_command(streams: Streams, epoch: int) -> Command | None:
@@ -289,8 +269,9 @@ def _find_exclusion(exclusion: SensorExclusion, section: Section, streams: Strea
         remedies = suggest("state_units", {"read": {"imu_units": exclusion.units}})
     elif exclusion.turned_by is not None:
         remedies = state_extrinsics(name, sensor.xyz_m, exclusion.turned_by @ matrix_from_quat(sensor.quat_xyzw))
-    elif exclusion.is_suspect_excludable:
-        remedies = exclude_role(exclusion.names["suspect"], "exclude_suspect")
+    elif exclusion.scale is not None:
+        stated = (streams.report.facts.odometry_scale or {}).get(name, 1.0)
+        remedies = suggest("state_scale", {"read.odometry_scale": {name: round(stated / exclusion.scale, 4)}})
     else:
         remedies = exclude_role(name)
     numbers: Mapping[str, Any] = exclusion.numbers

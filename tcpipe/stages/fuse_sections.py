@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.audit import audit_trajectory
 from tcpipe.fusion.checks.clock_offsets import NOTED_S
 from tcpipe.fusion.checks.sanity import Command
 from tcpipe.fusion.error_state import run_error_state
@@ -32,21 +31,18 @@ from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import Section, rank_sections
 from tcpipe.stages.message_arrays import make_rails
-from tcpipe.tables.facts import Disagreement, StretchFacts
+from tcpipe.tables.facts import StretchFacts
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import REJECTIONS, Streams
 
 
 @dataclass(slots=True)
 class Fused:
-    """Trajectory, facts, columns and audit of every track section; time without a track [s]; whether the direction of one is assumed."""
+    """Trajectory, facts and columns of every track section; time without a track [s]; whether the direction of one is assumed."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
     columns: list[Mapping[str, Signal]] = field(default_factory=list)
-    disagreements: list[Disagreement] = field(default_factory=list)
-    windows: int = 0
-    astray: int = 0
     skipped_s: float = 0.0
     is_forward_assumed: bool = False
 
@@ -73,13 +69,9 @@ def fuse_section(section: Section, streams: Streams, config: FuseConfig, last: T
             commanded_mps = make_command_columns(section.command, output_ns)["commanded_velocity_mps"]
             trajectory = assume_forward(trajectory, m.gnss.lever_arm_m, commanded_mps)
             fused.is_forward_assumed |= not np.isfinite(commanded_mps).any()
-        # 3. The audit compares the track with its sensors.
-        trajectory, audit = audit_trajectory(trajectory, trajectory.corrected or m)
-        fused.disagreements += (replace(each, clock_epoch=section.clock_epoch) for each in audit.disagreements)
-        fused.windows, fused.astray = fused.windows + audit.windows, fused.astray + audit.astray
         fused.found.append(trajectory)
         fused.facts.append(make_section_facts(part, initial, trajectory))
-        # 4. Other quantities at the track's stamps.
+        # 3. Other quantities at the track's stamps.
         fused.columns.append(_make_columns(part, trajectory, section, streams, config))
         last = trajectory
     return fused
@@ -104,7 +96,8 @@ def _estimate(
     return run_error_state(section.measurements, initial, output_ns=output_ns, gate_probability=gate)
 
 
-_SHOWN_M = 0.2  # shorter drives may be noise of a stationary robot
+_SHOWN_M = 0.2
+"""Least length of a drive that shows its direction [m]: shorter ones may be noise of a stationary robot."""
 _HALF_TURN = np.array([0.0, 0.0, 1.0, 0.0])
 
 

@@ -163,7 +163,7 @@ def find_motion_flags(
 def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
     """Return the segments of one epoch that touch a time in which sensors disagree.
 
-    A sensor disagrees with the track, fixes were off it, or the estimate of the whole section does not explain its sensors.
+    Fixes were off the track, or the estimate of the whole section does not explain its sensors.
     """
     limits = (
         read_threshold("measurements-rejected", "max_rejected_fraction"),
@@ -171,7 +171,7 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
     )
     start_ns, end_ns, epoch = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(cut, "clock_epoch")
     facts = info.report.facts
-    times = [(e.clock_epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ())]
+    times: list[tuple[int, int, int]] = []
     for section in facts.fuse.stretches if facts.fuse else ():
         times += [(section.clock_epoch, r.start_ns, r.end_ns) for r in section.gate_resets if r.role in FIXES]
         if not section.is_explained(*limits):

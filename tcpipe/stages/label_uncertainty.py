@@ -263,7 +263,7 @@ _MOTION = (*FIXES, WHEELS, VISUAL)
 
 
 def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts) -> NDArray[np.int32]:
-    """Return how many sensors measured motion in each segment of one epoch, were fused, and do not disagree with the track, shape (M,)."""
+    """Return how many sensors measured motion in each segment of one epoch and were fused, shape (M,)."""
     start_ns, end_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     epoch = int(to_integers(cut, "clock_epoch")[0])
     count = np.zeros(cut.num_rows, dtype=np.int32)
@@ -275,12 +275,7 @@ def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts)
             for section in (facts.fuse.stretches if facts.fuse else ())
             if section.clock_epoch == epoch and sensor in section.sensors
         ]
-        disputed = [
-            (span.start_ns, span.end_ns)
-            for span in (facts.audit.disagreements if facts.audit else ())
-            if span.clock_epoch == epoch
-        ]
-        count += confirms & _touches(fused, start_ns, end_ns) & ~_touches(disputed, start_ns, end_ns)
+        count += confirms & _touches(fused, start_ns, end_ns)
     return count
 
 

@@ -229,7 +229,6 @@ def find_gaps(
     """Return the rows that are in a gap by cause, and the findings; a row may have several causes.
 
     An error of scale that all of a run has in common makes no segment worse than the next: it is not part of a chord's own uncertainty.
-    All rows are contradicted where sensors contradict each other over most of the distance and no third decides.
     """
     power = to_floats(track.table, "power_watt")
     without_power = np.isnan(power) & bool(np.isfinite(power).any())
@@ -261,10 +260,8 @@ def find_gaps(
         at_s = (int(stamp_ns[furthest]) - int(stamp_ns[0])) / 1e9
         jump_m = float(off_m.max())
         findings.append(make_finding("position-jumps", run, span_s=(at_s, at_s), jump_m=jump_m, jump_count=far))
-    audit = track.info.report.facts.audit
-    contradicted = np.full(len(moving), bool(audit and audit.undecided))
     implausible, too_fast = find_implausible(track, rows, jumps, max_plausible_mps)
-    gaps = {"without_power": without_power, "uncertain": uncertain, "jumps": jumps, "contradicted": contradicted}
+    gaps = {"without_power": without_power, "uncertain": uncertain, "jumps": jumps}
     return {**gaps, "implausible": implausible}, (*findings, *too_fast)
 
 

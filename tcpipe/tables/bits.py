@@ -63,7 +63,7 @@ class Quality(IntFlag):
     BELOW_FULL_SPEED = 1 << 10
     """Commanded on average below `full_speed_fraction` of the robot's maximum: the terrain does not limit the speed."""
     SENSORS_DISAGREE = 1 << 11
-    """The track moves unlike every sensor, contradicted the fixes for seconds, or does not explain its sensors."""
+    """The track contradicted the fixes for seconds, or does not explain its sensors."""
     UNPOWERED = 1 << 12
     """The robot moves with its idle power over several segments, though their speed and slope need clearly more."""
     MAP_CONTRADICTS_TRACK = 1 << 13

@@ -192,30 +192,6 @@ class SensorChecks:
 
 
 @dataclass(frozen=True, slots=True)
-class Disagreement:
-    """A span in which the track's displacement differs from that of every sensor (`tcpipe.fusion.checks.audit`).
-
-    ``sensor`` is the nearest, ``size`` [m] the largest difference over a window, ``expected_std`` [m] the sensor's σ. The track's σ is
-    inflated there, and segments are flagged sensors_disagree.
-    """
-
-    start_ns: int
-    end_ns: int
-    sensor: str
-    size: float
-    expected_std: float
-    clock_epoch: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class AuditFacts:
-    """Where the track disagrees with every sensor, and the sensors of which nothing shows that their distance is right: no segments."""
-
-    disagreements: tuple[Disagreement, ...] = ()
-    undecided: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class ClockPair:
     """Two sensors compared: by what, how late the first's stamps are against the second's, and how much one explains the other (0 to 1).
 
@@ -478,7 +454,6 @@ class StageFacts:
     power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
-    audit: AuditFacts | None = field(default=None, metadata=LEFT_OUT)
     clock_offsets: tuple[ClockFacts, ...] = field(default=(), metadata=LEFT_OUT)
     """Time offsets between the sensors of each section, in order of clock epoch and time."""
     mask: MaskFacts | None = field(default=None, metadata=LEFT_OUT)

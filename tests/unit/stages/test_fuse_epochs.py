@@ -13,14 +13,12 @@ from unit.fusion import drive
 from unit.fusion.checks.test_clock_offsets import HALF_HOUR, drive_with_clocks
 from unit.stages.test_fuse import filled, streams_of
 
-from tcpipe.fusion.checks.sanity import Command
-from tcpipe.fusion.measurements import Measurements, select_measurements
+from tcpipe.fusion.measurements import select_measurements
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.fuse_clocks import correct_clocks, find_clocks, find_offsets
-from tcpipe.stages.fuse_findings import make_audit_findings
 from tcpipe.stages.fuse_inputs import Section, drop_implausible_sensors
-from tcpipe.stages.fuse_sections import Fused, find_exclusions
+from tcpipe.stages.fuse_sections import find_exclusions
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import COMMAND, Sensor, Streams
@@ -145,23 +143,6 @@ def test_a_mounting_that_the_long_epoch_shows_holds_in_one_that_shows_nothing(se
     ]
     (finding,) = find_exclusions(drop(short, backwards))
     assert finding.code == "drives-backwards"
-
-
-def test_the_commands_of_the_shorter_epoch_show_that_its_wheels_are_too_fast(sensors):
-    """A robot without fixes: nothing else shows the scale of its wheels."""
-    alone = Measurements(wheels=sensors.wheels)
-    stamp_ns, speed_mps = sensors.wheels.stamp_ns, np.ones(sensors.wheels.stamp_ns.size)
-    wheels = replace(
-        sensors.wheels, velocity_mps=np.column_stack((1.25 * speed_mps, sensors.wheels.velocity_mps[:, 1:]))
-    )
-    short = select_measurements(replace(alone, wheels=wheels), stamp_ns[0], stamp_ns[0] + 60 * 10**9)
-    commands = [Command(stamp_ns + by_ns, speed_mps, 0.0 * speed_mps) for by_ns in (0, DAYS_NS)]
-    long = Measurements(wheels=replace(wheels, velocity_mps=wheels.velocity_mps / 1.25))
-    sections = [Section(0, long, commands[0]), Section(1, later(short), commands[1])]
-    audit = make_audit_findings(Fused(), sections, STREAMS)
-    assert audit.facts.undecided == ("wheel_odometry",)
-    assert audit.findings[0].numbers["speed_ratio"] == pytest.approx(1.25)
-    assert make_audit_findings(Fused(), sections[:1], STREAMS).facts.undecided == ()
 
 
 def test_fixes_that_are_frozen_in_one_epoch_take_no_place_from_the_other(streams):

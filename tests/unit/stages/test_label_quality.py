@@ -16,11 +16,9 @@ from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.facts import (
-    AuditFacts,
     ClockFacts,
     ClockOffset,
     ClockStep,
-    Disagreement,
     FuseFacts,
     GateReset,
     MaskFacts,
@@ -127,24 +125,26 @@ def test_a_hole_counts_by_the_rows_on_both_of_its_sides(late, near):
 
 
 def disagreement(start_ns, end_ns, *, clock_epoch=0):
-    return AuditFacts((Disagreement(int(start_ns), int(end_ns), "gnss", 1.0, 0.1, clock_epoch),))
+    reset = GateReset("gnss", int(start_ns), int(end_ns), 1.0)
+    stretch = StretchFacts({}, {}, {}, clock_epoch=clock_epoch, gate_resets=(reset,))
+    return FuseFacts(200, ("gnss",), {}, {}, {}, {}, 0.0, (stretch,))
 
 
 @pytest.mark.parametrize(
     ("before", "behind", "touches"), [(-50, 0, True), (-50, -1, False), (20e9, 30e9, False), (1e9, 2e9, True)]
 )
 def test_a_disagreement_counts_where_it_touches_a_segment(before, behind, touches):
-    audit = disagreement(STAMPS[100] + int(before), STAMPS[100] + int(behind))
-    assert (flags(cut(), about=info(audit=audit)) == {Quality.SENSORS_DISAGREE}) == touches
+    fuse = disagreement(STAMPS[100] + int(before), STAMPS[100] + int(behind))
+    assert (flags(cut(), about=info(fuse=fuse)) == {Quality.SENSORS_DISAGREE}) == touches
 
 
 def test_a_disagreement_of_another_epoch_is_none():
     span = STAMPS[100], STAMPS[120]
-    assert flags(cut(), about=info(audit=disagreement(*span, clock_epoch=1))) == set()
+    assert flags(cut(), about=info(fuse=disagreement(*span, clock_epoch=1))) == set()
     later = cut(clock_epoch=np.ones(1, np.int16))
-    assert flags(later, about=info(audit=disagreement(*span))) == set()
-    assert flags(later, about=info(audit=disagreement(*span, clock_epoch=1))) == {Quality.SENSORS_DISAGREE}
-    assert flags(cut(), about=info(audit=disagreement(STAMPS[120] + 1, STAMPS[130]))) == set()
+    assert flags(later, about=info(fuse=disagreement(*span))) == set()
+    assert flags(later, about=info(fuse=disagreement(*span, clock_epoch=1))) == {Quality.SENSORS_DISAGREE}
+    assert flags(cut(), about=info(fuse=disagreement(STAMPS[120] + 1, STAMPS[130]))) == set()
 
 
 @pytest.mark.parametrize(("role", "disputed"), [("gnss", True), ("wheel_odometry", False)])

@@ -11,7 +11,7 @@ from tcpipe.recipe import MaskConfig, SegmentConfig, TimeWindow
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.facts import AuditFacts, FuseFacts, StretchFacts
+from tcpipe.tables.facts import FuseFacts, StretchFacts
 from tcpipe.tables.findings import StageReport, select_findings
 
 T = np.arange(0, 60, 0.05)
@@ -156,7 +156,6 @@ def test_a_jump_is_a_gap_and_not_driven():
         "without_power": 0,
         "uncertain": 0,
         "jumps": 2,
-        "contradicted": 0,
         "implausible": 0,
     }
     (finding,) = select_findings(masked.info.report.findings, "position-jumps")
@@ -186,14 +185,6 @@ def test_an_error_of_scale_that_a_run_has_in_common_makes_no_gap():
     facts = replace(track.info.report.facts, fuse=FuseFacts(200, (), {}, {}, {}, {}, 0.0, (stretch,)))
     known = gate(replace(track, info=replace(track.info, report=StageReport((), facts))))
     assert not rows_of(known, DropReason.GAP).any()
-
-
-def test_a_run_whose_sensors_contradict_each_other_undecided_is_all_gap():
-    track = straight_track(np.full(200, 0.9))
-    facts = replace(track.info.report.facts, audit=AuditFacts((), ("gnss",)))
-    masked = gate(replace(track, info=replace(track.info, report=StageReport((), facts))))
-    assert rows_of(masked, DropReason.GAP).all()
-    assert masked.info.report.facts.mask.gap_rows["contradicted"] == 200
 
 
 def test_rows_and_reasons_are_counted():
