@@ -299,7 +299,7 @@ def test_the_first_minute_shows_a_unit_or_contradicts_a_table(tmp_path, is_noise
         assert "in the first minute: gnss: the outlier gate rejected" in text
     else:
         assert values["tables"]["wheel_odometry"]["units"] == {"linear_x": "km/h"}
-        assert "in the first minute: wheel_odometry: scale 3.59" in text
+        assert "in the first minute: wheel_odometry: drives 3.59" in text
 
 
 def test_what_ingest_would_reject_is_a_comment(tmp_path):
