@@ -33,14 +33,6 @@ class RunInputs:
     """Hash of the definitions that were given for types which the log does not define."""
 
 
-@dataclass(frozen=True, slots=True)
-class ExclusionInputs:
-    """One list of excluded samples."""
-
-    sha256: str
-    reason: str
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetInputs:
     """Everything that a dataset is made of; files are named by the sha256 of their content."""
@@ -63,10 +55,6 @@ class DatasetInputs:
     """By kind of polygon: the sha256 of its coordinates."""
     covariates: Mapping[str, str] = field(default_factory=dict)
     """By file: its sha256."""
-    exclusions: Mapping[str, ExclusionInputs] = field(default_factory=dict)
-    """By file."""
-    kept_split: str | None = None
-    """The sha256 of the splits of the earlier dataset, which its samples keep."""
     file_format: str
     labels: tuple[str, ...] = ()
     """Labels that every sample needs; none: the default."""
@@ -158,14 +146,6 @@ class LabelStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class KeptSplit:
-    """Numbers of samples that keep the split of an earlier dataset, and of its samples that are missing now."""
-
-    samples: int
-    gone: int
-
-
-@dataclass(frozen=True, slots=True)
 class SplitResult:
     """Result of the recipe's section ``split``, and of its audit."""
 
@@ -174,7 +154,6 @@ class SplitResult:
     region: Mapping[str, PolygonGeometry] | None
     """By kind: train_test, unseen, exclude."""
     audit: tuple[HeldOut, ...]
-    kept: KeptSplit | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,23 +187,6 @@ class Covariate:
     first: str
     last: str
     samples_without: Mapping[str, int]
-
-
-@dataclass(frozen=True, slots=True)
-class Exclusion:
-    """A list of samples that a user excluded, and why."""
-
-    name: str
-    checksum: Checksum
-    reason: str
-    listed: int
-    """Ids in the list."""
-    samples: int
-    """Samples that the dataset would have without it."""
-
-    def __str__(self) -> str:
-        """Return name, count and reason."""
-        return f"{self.name}: {self.samples} samples excluded: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,7 +325,6 @@ class DatasetCard:
     covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
     added_columns: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
-    exclusions: tuple[Exclusion, ...] = field(default=(), metadata=LEFT_OUT)
     """A sample of two lists counts for the first one."""
     without_coordinates: bool = field(default=False, metadata={"json": (False,)})
     """Whether places are metres from an unpublished origin; then names, times, maps and regions are omitted too."""

@@ -4,7 +4,6 @@
 
     dataset.json  croissant.json  samples.parquet  report.html
     overview.png  relief.png  classes.png                    the map, small, as the report shows it
-    excluded.csv                                             ids that a user excluded, why, and whether they were samples
     report-patches/                                          pictures of all patches, after `tcpipe report --patches`
     patches.zarr/{ortho,terrain,height,sample_id}            --format zarr
     data/<split>-00000-of-00001.parquet                      --format parquet: the same layers, a row a sample
@@ -59,7 +58,6 @@ SHARDS = "data"
 OVERVIEW = "overview.png"
 RELIEF = "relief.png"
 CLASSES = "classes.png"
-EXCLUDED = "excluded.csv"
 
 CHUNK_ROWS = 256
 """Patches that are decoded together."""
@@ -450,12 +448,6 @@ def find_places_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> NDAr
 
 _ID_COLUMNS = ("sample_id", "segment_id")
 
-EXCLUDED_IDS = pa.schema([(name, pa.string()) for name in ("sample_id", "list", "reason", "outcome")])
-"""Columns of `EXCLUDED`."""
-
-IS_EXCLUDED = "excluded"
-"""Outcome of an id that would be a sample."""
-
 
 def read_sample_ids(path: Path) -> list[str]:
     """Return the ids of a list, each once, in its order: the column sample_id or segment_id of a CSV file, or the lines of a text.
@@ -477,13 +469,3 @@ def read_sample_ids(path: Path) -> list[str]:
     if not ids:
         raise DatasetError(f"{path}: contains no sample id; expected a column sample_id, or one id a line")
     return ids
-
-
-def read_exclusion_reason(directory: Path, sample_id: str) -> str | None:
-    """Return by which list and why a sample was excluded from a dataset; None if it was not."""
-    path = directory / EXCLUDED
-    if not path.is_file():
-        return None
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if (row["sample_id"], row["outcome"]) == (sample_id, IS_EXCLUDED)]
-    return f"{rows[0]['list']}: {rows[0]['reason']}" if rows else None

@@ -224,7 +224,7 @@ def _count_moved(ours: NDArray[np.object_], theirs: NDArray[np.object_]) -> dict
 
 
 _WORDS = {
-    "versions": "version", "runs": "run", "tags": "chosen tags", "maps": "map", "map_names": "order of maps", "exclusions": "exclusion",
+    "versions": "version", "runs": "run", "tags": "chosen tags", "maps": "map", "map_names": "order of maps",
     "file_format": "format",
 }  # fmt: skip
 """Names of fields of `DatasetInputs` in messages; other fields keep their name."""

@@ -18,7 +18,6 @@ from tcpipe.formats.dataset_card import DatasetCard, MapSource
 from tcpipe.formats.dataset_files import (
     SAMPLES,
     is_shard,
-    read_exclusion_reason,
     read_intact_card,
     read_samples,
     sample_columns,
@@ -166,8 +165,6 @@ def _read_sample(directory: Path, sample_id: str) -> Row:
     ids = read_samples(directory, ["sample_id"]).column("sample_id")
     row = pc.index(ids, sample_id).as_py()
     if row < 0:
-        if reason := read_exclusion_reason(directory, sample_id):
-            raise DatasetError(f"{directory}: sample {sample_id} was excluded when the dataset was built, by {reason}")
         near = [name for name in ids.to_pylist() if sample_id and sample_id in name][:3]
         hint = f"; did you mean {', '.join(near)}?" if near else f"; an example is {ids[0].as_py()}" if len(ids) else ""
         raise DatasetError(f"{directory}: no sample {sample_id!r}{hint}")

@@ -178,21 +178,7 @@ class BuildDatasetOptions:
             (), "input_file", "FILE", repeatable=True
         ),
     )  # fmt: skip
-    exclude: str | Path | Sequence[str | Path] = option(
-        (),
-        Option(
-            "List of samples to exclude: CSV with a column sample_id, or one id a line; needs --reason; repeatable.",
-            (), "input_file", "FILE", repeatable=True
-        ),
-    )  # fmt: skip
-    reason: str | Sequence[str] = option(
-        (), Option("Why the samples of an --exclude are excluded; one for each.", metavar="TEXT", repeatable=True)
-    )
     seed: int | None = option(None, Option("Seed of split and row order (default: from the recipe).", (), SEED))
-    keep_split: str | Path | None = option(
-        None,
-        Option("An earlier dataset (OUT is possible) whose samples keep their split and fold.", (), "sealed", "OLD"),
-    )
     min_runs: int | None = option(
         None,
         Option(

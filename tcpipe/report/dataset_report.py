@@ -279,7 +279,6 @@ def _make_provenance_section(card: DatasetCard) -> Section:
             for grid in card.maps
         ),
         *((f"log of {run.run_id}", f"sha256 {run.sha256}") for run in card.runs if run.sha256),
-        *(("excluded", str(exclusion)) for exclusion in card.exclusions),
         ("licence", card.licence or "none given"),
         ("creator", card.creator or "none given"),
     ]

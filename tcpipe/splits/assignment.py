@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.splits.regions import Regions, Side, classify_footprints
+from tcpipe.splits.regions import Regions, classify_footprints
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.signedinteger]
@@ -37,8 +37,8 @@ UNDECIDED = -1
 NO_FOLD = UNDECIDED
 """Fold of a sample that is neither train nor test."""
 
-_NAMES = np.array([*SPLITS, EXCLUDED, ""])
-_TRAIN, _TEST, _UNSEEN, _BUFFER, _EXCLUDED, _NEW = np.arange(len(_NAMES), dtype=np.uint8)
+_NAMES = np.array([*SPLITS, EXCLUDED])
+_TRAIN, _TEST, _UNSEEN, _BUFFER, _EXCLUDED = np.arange(len(_NAMES), dtype=np.uint8)
 _CODE_BY_SIDE = np.array([_TRAIN, _UNSEEN, _BUFFER, _EXCLUDED])
 
 _CHUNK = 65_536
@@ -51,16 +51,6 @@ class Groups:
 
     member: Ints
     names: tuple[str, ...]
-
-    def decided(self, values: Ints) -> Ints:
-        """Return for each group the value of most of its samples, shape (G,); ``values`` are small numbers or `UNDECIDED`, shape (N,)."""
-        kinds = int(values.max(initial=UNDECIDED)) + 1
-        if kinds == 0:
-            return np.full(len(self.names), UNDECIDED)
-        known = values != UNDECIDED
-        ballots = self.member[known] * kinds + values[known]
-        votes = np.bincount(ballots, minlength=len(self.names) * kinds).reshape(-1, kinds)
-        return np.where(votes.any(axis=1), votes.argmax(axis=1), UNDECIDED)
 
 
 def assign_blocks(corners_xy_m: Floats, rows: Ints, *, block_m: float) -> Groups:
@@ -77,7 +67,7 @@ def assign_blocks(corners_xy_m: Floats, rows: Ints, *, block_m: float) -> Groups
     return Groups(np.searchsorted(blocks, codes).astype(np.int32), names)
 
 
-def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: float, kept: Ints | None = None) -> Mask:
+def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: float) -> Mask:
     """Mark ceil(test_fraction · n) samples as test, shape (N,): of every arrival those of lowest rank, to make up the share so far.
 
     A later arrival moves no earlier sample; one in between changes every later arrival by at most one sample.
@@ -86,29 +76,18 @@ def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: flo
     ----------
     ranks : rank of each sample, shape (N,).
     arrival : number of each sample's run in the order of recording, shape (N,).
-    kept : 1 for fixed test samples, 0 for fixed training samples, else `UNDECIDED`, shape (N,).
     """
     exact = Fraction(str(test_fraction))  # 0.2 * 35 is 7.000000000000001 in binary
-    kept = np.full(len(ranks), UNDECIDED) if kept is None else kept
-    test: Mask = kept == 1
-    order = np.lexsort((ranks, arrival))
+    test: Mask = np.zeros(len(ranks), np.bool_)
+    order, first = np.lexsort((ranks, arrival)), 0
     ends: list[int] = [*(np.flatnonzero(np.diff(arrival[order])) + 1).tolist(), len(order)]
-    missing, first = -int(test.sum()), 0
     for end in ends:
-        missing += math.ceil(exact * end) - math.ceil(exact * first)
-        free = order[first:end][kept[order[first:end]] == UNDECIDED]
-        chosen = free[: max(missing, 0)]
-        test[chosen] = True
-        missing, first = missing - len(chosen), end
-    if missing > 0:
-        rest = np.flatnonzero((kept == UNDECIDED) & ~test)
-        test[rest[np.argsort(ranks[rest], kind="stable")][:missing]] = True
+        test[order[first : first + math.ceil(exact * end) - math.ceil(exact * first)]] = True
+        first = end
     return test
 
 
-def draw_groups(
-    groups: Groups, arrival: Ints, *, test_fraction: float, seed: int, kept: Ints | None = None
-) -> NDArray[np.bool_]:
+def draw_groups(groups: Groups, arrival: Ints, *, test_fraction: float, seed: int) -> NDArray[np.bool_]:
     """Mark whole groups as test, shape (G,), nearest to a share ``test_fraction`` of the samples.
 
     After each arrival the groups so far are visited by rank; a training group joins test if that brings the share nearer to
@@ -117,14 +96,11 @@ def draw_groups(
     Parameters
     ----------
     arrival : number of each sample's run in the order of recording, shape (N,).
-    kept : 1 for fixed test groups, 0 for fixed training groups, else `UNDECIDED`, shape (G,).
     """
-    count = len(groups.names)
-    kept = np.full(count, UNDECIDED) if kept is None else kept
-    tests: Mask = kept == 1
+    tests: Mask = np.zeros(len(groups.names), np.bool_)
     order = sort_by_rank(groups.names, seed=seed, purpose="test")
     for sizes in _iterate_sizes(groups, arrival):
-        free = order[(kept[order] == UNDECIDED) & (sizes[order] > 0)]
+        free = order[sizes[order] > 0]
         _take(tests, free, sizes, wanted=test_fraction * float(sizes.sum()))
     return tests
 
@@ -141,12 +117,12 @@ def _take(tests: Mask, free: Ints, sizes: Ints, *, wanted: float) -> None:
         tests[free[np.argmin(np.abs(sizes[free] - wanted))]] = True
 
 
-def draw_folds(groups: Groups, arrival: Ints, *, folds: int, seed: int, kept: Ints | None = None) -> Ints:
+def draw_folds(groups: Groups, arrival: Ints, *, folds: int, seed: int) -> Ints:
     """Deal groups to folds of cross-validation, shape (G,), from 0 on: each to the smallest fold when it first appears.
 
-    ``arrival`` is as in `draw_groups`; ``kept`` has the fixed fold of a group or `UNDECIDED`, shape (G,).
+    ``arrival`` is as in `draw_groups`.
     """
-    fold = np.full(len(groups.names), UNDECIDED) if kept is None else kept.copy()
+    fold = np.full(len(groups.names), UNDECIDED)
     order = sort_by_rank(groups.names, seed=seed, purpose="fold")
     for sizes in _iterate_sizes(groups, arrival):
         new = order[(fold[order] == UNDECIDED) & (sizes[order] > 0)]
@@ -181,12 +157,6 @@ class Assignment:
     code: NDArray[np.uint8]
     fold: NDArray[np.int8]
 
-    @classmethod
-    def from_names(cls, split: Names, fold: NDArray[np.signedinteger]) -> Assignment:
-        """Return an assignment by the names of splits; "" for none."""
-        order = np.argsort(_NAMES)
-        return cls(order[np.searchsorted(_NAMES, split, sorter=order)].astype(np.uint8), fold.astype(np.int8))
-
     @property
     def split(self) -> Names:
         """The split of every sample by its name: one of `SPLITS` or `EXCLUDED`."""
@@ -196,12 +166,6 @@ class Assignment:
     def is_in(self, *splits: str) -> Mask:
         """Return which samples are in one of these splits, shape (N,)."""
         return np.isin(_NAMES, splits)[self.code]
-
-    def exclude(self, rows: Mask) -> Assignment:
-        """Return the assignment with some samples, a mask of shape (N,), in no split."""
-        return Assignment(
-            np.where(rows, _EXCLUDED, self.code).astype(np.uint8), np.where(rows, NO_FOLD, self.fold).astype(np.int8)
-        )
 
     def select(self, rows: Ints) -> Assignment:
         """Return the assignment of some samples."""
@@ -221,7 +185,6 @@ def assign_splits(
     buffer_m: float,
     folds: int,
     seed: int,
-    kept: Assignment | None = None,
     tagged: tuple[Ints, Sequence[str]] | None = None,
 ) -> Assignment:
     """Return train, test, unseen, buffer or excluded for every sample, and the fold of those that train or test.
@@ -237,17 +200,12 @@ def assign_splits(
     block_m : side of a spatial block [m].
     buffer_m : a footprint nearer than this to a region's border is in no split [m].
     folds : number of folds; blocks (with the holdout ``run`` or ``tag`` runs or values) stay whole in them.
-    kept : assignment of an earlier dataset, "" and `NO_FOLD` for new samples: its samples move only where a region excludes them now.
     tagged : with the holdout ``tag``: number of each sample's value of the tag, shape (N,), and the values by number.
     """
     n = len(ranks)
     sides = np.zeros(n, np.uint8) if regions is None else classify_footprints(corners_xy_m, regions, buffer_m=buffer_m)
-    code, new = _CODE_BY_SIDE[sides], np.ones(n, np.bool_)
-    if kept is not None:
-        new = (kept.code == _NEW) | (sides == Side.EXCLUDED)
-        code = np.where(new, code, kept.code)
-    inside = np.flatnonzero(code <= _TEST)
-    known = np.where(new[inside], UNDECIDED, code[inside] == _TEST).astype(np.int8)
+    code = _CODE_BY_SIDE[sides]
+    inside = np.flatnonzero(code == _TRAIN)
     whole = {"run": (run, run_names), "tag": tagged}.get(holdout)
     groups = (
         assign_blocks(corners_xy_m, inside, block_m=block_m)
@@ -255,15 +213,12 @@ def assign_splits(
         else group_by_run(whole[0][inside], whole[1])
     )
     if holdout == "sample":
-        test = draw_samples(ranks[inside], run[inside], test_fraction=test_fraction, kept=known)
+        test = draw_samples(ranks[inside], run[inside], test_fraction=test_fraction)
     else:
-        chosen = draw_groups(groups, run[inside], test_fraction=test_fraction, seed=seed, kept=groups.decided(known))
-        test = np.where(known == UNDECIDED, chosen[groups.member], known == 1)
+        test = draw_groups(groups, run[inside], test_fraction=test_fraction, seed=seed)[groups.member]
     code[inside] = np.where(test, _TEST, _TRAIN)
     fold = np.full(n, NO_FOLD, np.int8)
-    old_fold = fold[inside] if kept is None else kept.fold[inside]
-    dealt = draw_folds(groups, run[inside], folds=folds, seed=seed, kept=groups.decided(old_fold)).astype(np.int8)
-    fold[inside] = np.where(old_fold == NO_FOLD, dealt[groups.member], old_fold)
+    fold[inside] = draw_folds(groups, run[inside], folds=folds, seed=seed)[groups.member]
     return Assignment(code, fold)
 
 

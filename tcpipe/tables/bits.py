@@ -93,8 +93,6 @@ class Loss(IntFlag):
     """The footprint is in a region whose `split` is `exclude`."""
     RECORDED_TWICE = 1 << 25
     """Another run of the dataset has the same section of the same drive."""
-    EXCLUDED = 1 << 26
-    """A list of samples to exclude (``--exclude``) names it."""
     NO_LABEL = 1 << 27
     """A segment without a label that was asked for (``--labels``), but for the energy: that is `NO_POWER`."""
     NO_POSITION = 1 << 28

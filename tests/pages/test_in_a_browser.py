@@ -233,7 +233,7 @@ def test_patches_and_rows_are_sorted_and_turned_page_by_page(opened):
 
 
 @pytest.mark.parametrize("look", [LOOKS[0], LOOKS[3]], ids=by_look)
-def test_ids_of_a_selection_open_and_exclude_these_samples(chromium, dataset, tmp_path, look):
+def test_ids_of_a_selection_open_these_samples(chromium, dataset, tmp_path, look):
     with quiet_page(chromium, dataset / "report.html", look) as tab:
         tab.select_option("#split", label="test")
         fits_and_can_be_read_by_everyone(tab)
@@ -253,11 +253,6 @@ def test_ids_of_a_selection_open_and_exclude_these_samples(chromium, dataset, tm
     assert chosen.column("sample_id").tolist() == copied
     assert set(chosen.column("split")) == {"test"}
     assert len(copied) == shown
-    built = build_dataset(
-        tmp_path / "smaller", store=dataset.parent / "store", exclude=tmp_path / "sample_ids.csv", reason="too far off"
-    )
-    assert built.card.splits["test"] == 0
-    assert built.card.exclusions[0].samples == shown
 
 
 def test_of_a_part_of_the_samples_the_page_says_what_a_selection_covers(chromium, dataset, tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from splits_squares import squares
 
-from tcpipe.splits.assignment import NO_FOLD, Assignment, Groups, assign_splits, draw_groups, hash_ranks
+from tcpipe.splits.assignment import Groups, assign_splits, draw_groups, hash_ranks
 from tcpipe.splits.audit import Footprints, audit_leakage, compute_nearest_m, compute_shared_fraction, find_near_pairs
 from tcpipe.splits.regions import Regions, Side, classify_footprints
 
@@ -86,7 +86,7 @@ def drives(draw):
     return np.concatenate(parts), np.repeat(np.arange(len(lengths)), lengths)
 
 
-def split_of(corners, run, names, *, holdout, fraction=0.2, kept=None):
+def split_of(corners, run, names, *, holdout, fraction=0.2):
     _, number = np.unique(run, return_inverse=True)
     ids = [f"{names[r]}-{i}" for r in np.unique(run) for i in range((run == r).sum())]
     return assign_splits(
@@ -101,7 +101,6 @@ def split_of(corners, run, names, *, holdout, fraction=0.2, kept=None):
         buffer_m=1.5,
         folds=3,
         seed=0,
-        kept=kept,
     )
 
 
@@ -129,21 +128,6 @@ def test_a_run_that_comes_in_between_moves_a_sample_a_run_at_most(driven, where)
         here = run[old] == number
         moved = (before == "test")[here] & (after[old] == "train")[here]
         assert moved.sum() <= 1
-
-
-@settings(max_examples=60, deadline=None)
-@given(drives(), st.integers(0, 7), st.sampled_from(["sample", "block", "run"]), st.sampled_from([0.1, 0.5]))
-def test_a_kept_split_moves_nothing_wherever_a_run_comes_in(driven, where, holdout, fraction):
-    corners, run = driven
-    names = [f"r{i}" for i in range(run.max() + 1)]
-    old = run != where % (run.max() + 1)
-    first = split_of(corners[old], run[old], names, holdout="block")
-    split, fold = np.full(len(run), "", "<U8"), np.full(len(run), NO_FOLD)
-    split[old], fold[old] = first.split, first.fold
-    kept = Assignment.from_names(split, fold)
-    after = split_of(corners, run, names, holdout=holdout, fraction=fraction, kept=kept)
-    assert (after.split[old] == first.split).all()
-    assert (after.fold[old] == first.fold).all()
 
 
 @settings(max_examples=40, deadline=None)

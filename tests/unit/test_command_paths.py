@@ -97,8 +97,6 @@ CALLS = [
     "build-dataset out --store empty --recipe gone.toml",
     "build-dataset other --store empty",
     "build-dataset file --store empty",
-    "build-dataset out --store empty --keep-split other",
-    "build-dataset out --store empty --exclude gone.csv --reason why",
     "cost-map gone out --store empty",
     "demo other",
     "diff empty empty",

@@ -92,7 +92,7 @@ class BuildResult:
         ledger += "".join(f", {-metres:.0f} m {name.replace('_', ' ')}" for metres, name in sorted(lost))
         floor = [] if card.energy_budget is None else [format_budget(card.energy_budget)]
         verdict = (f"verdict: {line}" for line in list_verdict(card.verdict))
-        return [head, ledger, *map(str, card.exclusions), *floor, *verdict]
+        return [head, ledger, *floor, *verdict]
 
     def _closing(self) -> list[str]:
         names = list_first(self.foreign_files, most=3)
@@ -161,7 +161,7 @@ class _Job:
 
 def _read_job(state: State, store: Store, options: BuildDatasetOptions, place: Path | str) -> _Job:
     known, is_intact = _read_card_in_bucket(place) if isinstance(place, str) else _read_card_in_place(place)
-    marks = read_build_options(options, merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed), place)
+    marks = read_build_options(options, merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed))
     inputs = choose_inputs(store, marks, state)
     left_out = _find_left_out(inputs, known, marks, options.min_runs)
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
@@ -206,12 +206,11 @@ def _build(
 def _describe_options(options: BuildDatasetOptions) -> Options:
     """Return the options of a call as JSON values, files as absolute paths, so that it can be planned again."""
     found = {entry.name: getattr(options, entry.name) for entry in fields(options) if entry.name not in _NOT_RECORDED}
-    for name in ("split", "keep_split", "recipe"):
+    for name in ("split", "recipe"):
         value = found[name]
         found[name] = make_absolute(value) if isinstance(value, str | Path) else None if value is None else _IN_PYTHON
-    for name in ("covariates", "exclude"):
-        given = [found[name]] if isinstance(found[name], str | Path) else found[name]
-        found[name] = [make_absolute(path) for path in given]
+    given = [options.covariates] if isinstance(options.covariates, str | Path) else options.covariates
+    found["covariates"] = [make_absolute(path) for path in given]
     return {name: value for name, value in found.items() if value is not False and value not in (None, (), [], {})}
 
 
@@ -230,7 +229,7 @@ def find_changed_parts(store: Store, state: State, output: Output) -> str:
     options = BuildDatasetOptions(output.where, store=store.root, **output.options)  # type: ignore[arg-type]  # as recorded
     try:
         recipe = merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
-        parts = plan_inputs(store, read_build_options(options, recipe, output.where), state).parts
+        parts = plan_inputs(store, read_build_options(options, recipe), state).parts
     except TcpipeError as error:
         return error.problems[0]
     except OSError as error:

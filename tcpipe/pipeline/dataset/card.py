@@ -125,7 +125,6 @@ def make_dataset_card(
         maps=tuple(map(_map_source, content.sources, inputs.made_from.maps.values(), content.registrations)),
         physics=fit_physics_by_robot(samples.filter(pc.equal(samples.column("split"), "train"))),
         covariates=content.covariates,
-        exclusions=content.exclusions,
         added_columns={field.name: field.metadata[b"doc"].decode() for field in content.samples.added.schema},
         shards=tuple(shards),
         checksums={},

@@ -22,7 +22,6 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import (
     LOCAL,
     Covariate,
-    Exclusion,
     MapRegistration,
     RunSource,
     Shard,
@@ -53,7 +52,7 @@ from tcpipe.pipeline.dataset.map_checks import find_contradictions, find_driven_
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import list_needs, move_losses, pool_segments
 from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
-from tcpipe.pipeline.dataset.splitting import draw_splits, find_excluded, number_runs
+from tcpipe.pipeline.dataset.splitting import draw_splits, number_runs
 from tcpipe.recipe import CovariateConfig, Recipe, SplitConfig
 from tcpipe.recipe.suggestions import format_recipe_key, suggest
 from tcpipe.robots import Robot
@@ -180,9 +179,6 @@ class Content:
     registrations: Sequence[tuple[MapRegistration, ...]]
     """By map, one for each run."""
     covariates: tuple[Covariate, ...]
-    exclusions: tuple[Exclusion, ...]
-    excluded: pa.Table
-    """Each id of these lists with its reason and outcome."""
     findings: tuple[Finding, ...]
 
 
@@ -227,21 +223,17 @@ def gather_content(directory: Path, inputs: ChosenInputs, options: BuildOptions,
             *_describe_uncertainty(segments, lost_m, inputs, recipe),
         )
     tags = read_tags(pc.unique(segments.column("run_id")).to_pylist(), inputs.sources, recipe.split)
-    excluded = find_excluded(options.exclusions, segments.column("segment_id"), sampled.kept)
     assigned, result = draw_splits(
         segments,
         sampled,
         projection,
         options.regions,
         recipe,
-        excluded=excluded.mask,
-        earlier=options.earlier,
         tags=tags,
     )
     unused = {
         Loss.SPLIT_BUFFER: assigned.is_in("buffer"),
-        Loss.SPLIT_EXCLUDED: assigned.is_in(EXCLUDED) & ~excluded.mask,
-        **({Loss.EXCLUDED: excluded.mask} if options.exclusions else {}),
+        Loss.SPLIT_EXCLUDED: assigned.is_in(EXCLUDED),
     }
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
     unused_m = {loss: arc_m[rows].sum() for loss, rows in unused.items()}
@@ -272,9 +264,7 @@ def gather_content(directory: Path, inputs: ChosenInputs, options: BuildOptions,
         distance_by_reason_m=move_losses(distance_by_reason_m, {**lost_m, **unused_m}),
         registrations=[registrations for registrations, _ in registered],
         covariates=covariates,
-        exclusions=excluded.lists,
-        excluded=excluded.ids,
-        findings=(*found, *excluded.findings, *narrow, *obstacles, *incomplete),
+        findings=(*found, *narrow, *obstacles, *incomplete),
     )
 
 

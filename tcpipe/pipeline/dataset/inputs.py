@@ -5,8 +5,6 @@ Recordings that are in the store twice: one file under two names, or two recordi
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import shlex
 from collections import Counter
@@ -25,7 +23,6 @@ from tcpipe.errors import DatasetError, MapError, StoreError, list_first
 from tcpipe.formats.dataset_card import (
     DatasetCard,
     DatasetInputs,
-    ExclusionInputs,
     RecordChange,
     RunInputs,
     RunSource,
@@ -117,8 +114,6 @@ def _describe_inputs(options: BuildOptions, runs: Sequence[StoredRun], maps: Seq
         map_names=tuple(record.name for record in maps),
         region=None if options.regions is None else {kind: digest(polygon) for kind, polygon in regions.items()},
         covariates={table.name: table.checksum.sha256 for table in options.covariates},
-        exclusions={ids.name: ExclusionInputs(ids.checksum.sha256, ids.reason) for ids in options.exclusions},
-        kept_split=None if options.earlier is None else _hash_table(options.earlier),
         file_format=options.file_format,
         labels=options.labels,
         without_patches=options.without_patches,
@@ -201,22 +196,12 @@ def _make_source(run: StoredRun) -> RunSource:
     return convert_record(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
 
 
-def _hash_table(table: pa.Table) -> str:
-    """Return the sha256 (hex) of a table's values, hashed piece by piece."""
-    found = hashlib.sha256()
-    for batch in table.to_batches(max_chunksize=65_536):
-        found.update(json.dumps(batch.to_pydict(), sort_keys=True).encode())
-    return found.hexdigest()
-
-
 _OPTIONS = {
     "robots": "--robot",
     "tags": "--tag",
     "map_names": "--map",
     "region": "--split",
     "covariates": "--covariates",
-    "exclusions": "--exclude",
-    "kept_split": "--keep-split",
     "file_format": "--format",
     "labels": "--labels",
     "without_patches": "--without-patches",
@@ -242,9 +227,8 @@ def find_other_options(card: DatasetCard, options: BuildOptions, inputs: ChosenI
 
 def _is_option(change: RecordChange, options: BuildOptions) -> bool:
     """Return whether a change is of an option: a file may have other content, a store its first map, and the robot is that of the runs."""
-    if change.path[0] in ("covariates", "exclusions", "kept_split"):
-        is_own = change.path[0] == "kept_split" and options.keeps_own_split
-        return not is_own and None in (change.was, change.now)
+    if change.path[0] == "covariates":
+        return None in (change.was, change.now)
     if change.path[0] == "map_names":
         return bool(change.was or options.map_names)
     return change.path != ("recipe", "robot")
@@ -263,9 +247,9 @@ def _format_field(field: str, record: DatasetInputs) -> str:
     value = getattr(record, field)
     if field == "region" and value is not None:
         value = f"{' and '.join(value)} ({digest(value)[:8]})"
-    elif field in ("covariates", "exclusions"):
+    elif field == "covariates":
         value = tuple(value)
-    return format_value(value is not None if field == "kept_split" else value)
+    return format_value(value)
 
 
 _SAME_TIME_NS = 1_000_000_000

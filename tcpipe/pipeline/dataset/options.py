@@ -7,14 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pyarrow as pa
-
 from tcpipe.errors import DatasetError, RecipeError, UsageError
-from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_sample_ids, read_samples
+from tcpipe.formats.dataset_files import FileFormat
 from tcpipe.formats.geojson import read_regions
-from tcpipe.formats.integrity import Checksum, compute_checksum
-from tcpipe.formats.object_storage import make_absolute
-from tcpipe.formats.published_outputs import fetch_directory_by_range
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.recipe import CovariateConfig, Recipe, TrainConfig
@@ -23,33 +18,6 @@ from tcpipe.tables.levels import LABELS
 
 if TYPE_CHECKING:
     from tcpipe.formats.covariates import CovariateTable
-
-
-@dataclass(frozen=True, slots=True)
-class ExcludedIds:
-    """A list of samples that a user excludes: the file's name and checksum, why, and the ids."""
-
-    name: str
-    checksum: Checksum
-    reason: str
-    ids: tuple[str, ...]
-
-
-def read_exclusions(files: str | Path | Sequence[str | Path], reasons: str | Sequence[str]) -> tuple[ExcludedIds, ...]:
-    """Return the lists of samples to exclude; `UsageError` unless each has a reason, `DatasetError` if one cannot be read."""
-    paths = [Path(path) for path in ([files] if isinstance(files, str | Path) else files)]
-    texts = [text.strip() for text in ([reasons] if isinstance(reasons, str) else reasons)]
-    if len(texts) != len(paths) or not all(texts):
-        raise UsageError(
-            f"--exclude: {len(paths)} lists of samples and {len([text for text in texts if text])} reasons; "
-            "give each list its --reason TEXT, in the same order"
-        )
-    if len({path.name for path in paths}) < len(paths):
-        raise UsageError("--exclude: two lists have one name, by which the dataset names them; rename one")
-    return tuple(
-        ExcludedIds(path.name, compute_checksum(path), text, tuple(read_sample_ids(path)))
-        for path, text in zip(paths, texts, strict=True)
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,18 +34,13 @@ class BuildOptions:
     without_patches: bool
     regions: Regions | None
     covariates: tuple[CovariateTable, ...]
-    exclusions: tuple[ExcludedIds, ...]
     file_format: FileFormat
     without_coordinates: bool
-    earlier: pa.Table | None
-    """Samples of an earlier dataset, which keep their split."""
-    keeps_own_split: bool
-    """Whether that is the replaced dataset itself."""
 
 
-def read_build_options(options: BuildDatasetOptions, recipe: Recipe, place: Path | str) -> BuildOptions:
-    """Return a user's choices for the dataset at ``place``."""
-    split, map_name, keep_split = options.split, options.map_name, options.keep_split
+def read_build_options(options: BuildDatasetOptions, recipe: Recipe) -> BuildOptions:
+    """Return a user's choices for a dataset, read and checked."""
+    split, map_name = options.split, options.map_name
     if options.without_patches and map_name:
         raise UsageError("--map, --without-patches: samples without patches need no map; remove one of them")
     tables = [options.covariates] if isinstance(options.covariates, str | Path) else options.covariates
@@ -90,11 +53,8 @@ def read_build_options(options: BuildDatasetOptions, recipe: Recipe, place: Path
         without_patches=options.without_patches,
         regions=None if split is None else read_regions(Path(split)),
         covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
-        exclusions=read_exclusions(options.exclude, options.reason),
         file_format=options.file_format,
         without_coordinates=options.without_coordinates,
-        earlier=None if keep_split is None else read_earlier_splits(keep_split),
-        keeps_own_split=keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place),
     )
 
 
@@ -135,13 +95,3 @@ def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple
             f"--covariates: {twice[0]} is given twice; columns are named after the file: give each its own name"
         )
     return tuple(read_covariates(path, time_column=config.time_column, time_unit=config.time_unit) for path in paths)
-
-
-def read_earlier_splits(dataset: str | Path) -> pa.Table:
-    """Return ``sample_id``, ``split`` and ``fold`` of a dataset; `DatasetError` for another path."""
-    directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
-    if read_card(directory).without_coordinates:
-        raise DatasetError(
-            f"{directory}: is without coordinates, its samples have other names; give the dataset with them (--keep-split)"
-        )
-    return read_samples(directory, ["sample_id", "split", "fold"])

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
-from pyarrow.csv import write_csv
 
 from tcpipe.formats.atomic import write_text
 from tcpipe.formats.croissant import format_croissant
@@ -18,7 +17,6 @@ from tcpipe.formats.dataset_files import (
     CARD,
     CLASSES,
     CROISSANT,
-    EXCLUDED,
     OVERVIEW,
     RELIEF,
     SAMPLES,
@@ -65,8 +63,6 @@ def write_dataset(directory: Path, inputs: ChosenInputs, options: BuildOptions, 
         velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
         chord_m=recipe.segment.chord_m,
     )
-    if content.excluded.num_rows and public is None:
-        write_csv(content.excluded, directory / EXCLUDED)
     card = make_dataset_card(figures, options, inputs, content, repeatability=repeatability, shards=shards)
     card = card if public is None else public.make_card(card)
     shutil.rmtree(waiting)

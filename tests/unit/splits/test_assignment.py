@@ -9,8 +9,6 @@ from splits_squares import squares
 
 from tcpipe.splits.assignment import (
     NO_FOLD,
-    UNDECIDED,
-    Assignment,
     Groups,
     assign_blocks,
     assign_splits,
@@ -26,9 +24,7 @@ ROW = squares([(10.0 * i + 5.0, 5.0) for i in range(10)])
 """Each in a block of its own."""
 
 
-def assigned(
-    corners=ROW, *, run=None, regions=None, holdout="sample", kept=None, fraction=0.2, ranks=None, block_m=10.0
-):
+def assigned(corners=ROW, *, run=None, regions=None, holdout="sample", fraction=0.2, ranks=None, block_m=10.0):
     run = np.zeros(len(corners), int) if run is None else np.array(run)
     return assign_splits(
         np.arange(len(corners)).astype(np.uint64) if ranks is None else np.array(ranks, np.uint64),
@@ -42,14 +38,7 @@ def assigned(
         buffer_m=1.0,
         folds=2,
         seed=0,
-        kept=kept,
     )
-
-
-def kept(splits, folds=None):
-    names = {"t": "train", "T": "test", ".": "", "u": "unseen"}
-    folds = [NO_FOLD] * len(splits) if folds is None else folds
-    return Assignment.from_names(np.array([names[letter] for letter in splits]), np.array(folds))
 
 
 def test_the_lowest_ranks_test_and_all_inside_have_a_fold():
@@ -65,22 +54,6 @@ def test_each_region_has_its_word_and_no_fold_outside_of_train_and_test():
     assert ((found.fold != NO_FOLD) == [True, True, True, False, False, False, False]).all()
 
 
-def test_what_was_decided_stays_but_for_what_a_region_excludes_now():
-    regions = Regions(shapely.box(0, 0, 100, 10), exclude=shapely.box(90, 0, 100, 10))
-    before = kept("tT.......T", [1, 0, *[NO_FOLD] * 7, 0])
-    found = assigned(regions=regions, kept=before)
-    assert found.split[[0, 1, 9]].tolist() == ["train", "test", "excluded"]
-    assert found.fold[[0, 1, 9]].tolist() == [1, 0, NO_FOLD]
-    assert (found.split == "test").sum() == 2  # a fifth of nine
-
-
-@pytest.mark.parametrize("holdout", ["sample", "block", "run"])
-def test_a_sample_that_was_unseen_stays_unseen(holdout):
-    found = assigned(kept=kept("u........."), holdout=holdout, run=np.arange(10))
-    assert (found.split[0], found.fold[0]) == ("unseen", NO_FOLD)
-    assert set(found.split[1:]) == {"train", "test"}
-
-
 def test_whole_runs_or_whole_blocks_test():
     run = np.repeat([0, 1, 2, 3, 4], 2)
     by_run = assigned(run=run, holdout="run")
@@ -88,12 +61,6 @@ def test_whole_runs_or_whole_blocks_test():
     assert (by_run.fold[::2] == by_run.fold[1::2]).all()
     by_block = assigned(run=run, holdout="block", block_m=50.0)
     assert sorted(np.bincount([0] * 5 + [1] * 5, by_block.split == "test").tolist()) == [0, 5]
-
-
-def test_a_sample_of_a_group_that_tests_keeps_what_it_was():
-    run = np.repeat([0, 1], 5)
-    found = assigned(run=run, holdout="run", kept=kept("TTTt.ttttt"))
-    assert found.split.tolist() == ["test"] * 3 + ["train", "test"] + ["train"] * 5
 
 
 def test_runs_are_drawn_by_their_names():
@@ -130,16 +97,6 @@ def test_test_holds_the_lowest_ranks_of_every_run():
         assert (test & (run == number)).sum() in (66, 67)
 
 
-def test_samples_that_are_kept_stay_and_the_rest_fills_up():
-    kept = np.full(1000, UNDECIDED)
-    kept[:150], kept[150:300] = 1, 0
-    for arrival in (np.zeros(1000, int), np.arange(1000) // 100, -np.arange(1000) // 100):
-        test = draw_samples(ranks(IDS), arrival, test_fraction=0.2, kept=kept)
-        assert test[:150].all()
-        assert not test[150:300].any()
-        assert test.sum() == 200
-
-
 def test_row_order_says_nothing_of_the_holdout():
     order = np.argsort(hash_ranks(IDS, seed=0, purpose="order"))
     test = draw_samples(ranks(IDS), np.zeros(1000, int), test_fraction=0.5)[order]
@@ -174,13 +131,6 @@ def test_a_group_that_would_overshoot_is_passed_over():
         assert drawn(grouped([60, 20, 20]), seed=seed).sum() == 20
 
 
-def test_kept_groups_stay_as_they_are():
-    groups = grouped([10] * 20)
-    kept = np.full(20, UNDECIDED)
-    kept[:3], kept[3:] = 1, 0
-    assert drawn(groups, kept=kept).sum() == 30
-
-
 def test_a_fold_once_given_stays():
     groups = grouped([7] * 30)
     arrival = groups.member // 10
@@ -189,40 +139,10 @@ def test_a_fold_once_given_stays():
     assert draw_folds(groups, arrival, folds=3, seed=0)[:10].tolist() == first.tolist()
 
 
-def test_the_majority_decides_for_a_group_an_even_vote_trains_and_without_a_vote_nothing_is_decided():
-    votes = np.array([1, 0, 1, UNDECIDED, 0, UNDECIDED, UNDECIDED])
-    assert grouped([3, 2, 2]).decided(votes).tolist() == [1, 0, UNDECIDED]
-    groups = grouped([2, 4])
-    assert groups.decided(np.array([1, 0, 2, 2, 1, 0])).tolist() == [0, 2]
-    assert groups.decided(np.full(6, UNDECIDED)).tolist() == [UNDECIDED, UNDECIDED]
-
-
 def test_a_cell_begins_at_its_border_and_holds_one_group_in_every_direction():
     found = blocks(np.array([[10.0, 0.0], [9.999, 0.0], [-10.0, -0.001], [-0.001, -10.0]]))
     assert [found.names[member] for member in found.member] == ["10:1:0", "10:0:0", "10:-1:-1", "10:-1:-1"]
     assert blocks(np.zeros((0, 2))).names == ()
-
-
-def test_more_kept_than_wanted_draws_no_more():
-    kept = np.array([1, 1, 1, UNDECIDED, UNDECIDED])
-    assert (
-        draw_samples(np.arange(5)[::-1], np.zeros(5, int), test_fraction=0.2, kept=kept).tolist()
-        == [True] * 3 + [False] * 2
-    )
-    two_runs = np.array([0, 0, 0, 1, 1])
-    assert draw_samples(np.arange(5), two_runs, test_fraction=0.2, kept=kept).sum() == 3
-
-
-def test_what_a_run_cannot_give_the_lowest_ranks_of_all_make_up():
-    kept = np.array([UNDECIDED, UNDECIDED, UNDECIDED, 0, 0, 0])
-    test = draw_samples(np.array([2, 0, 1, 3, 4, 5]), np.array([0, 0, 0, 1, 1, 1]), test_fraction=0.5, kept=kept)
-    assert test.tolist() == [True, True, True, False, False, False]
-
-
-def test_a_group_that_brings_the_share_no_nearer_trains():
-    kept = np.array([1, UNDECIDED, UNDECIDED])
-    for seed in range(4):  # 10 test of 100, 20 are wanted: with 20 more it would be 30
-        assert drawn(grouped([10, 20, 70]), kept=kept, seed=seed).sum() == 10
 
 
 def test_at_least_one_tests_the_nearest_in_size_and_one_trains():
@@ -231,7 +151,6 @@ def test_at_least_one_tests_the_nearest_in_size_and_one_trains():
         assert drawn(grouped([1, 1, 1]), test_fraction=0.1, seed=seed).sum() == 1
         assert drawn(grouped([10, 10, 10]), test_fraction=0.99, seed=seed).sum() == 20
         assert drawn(grouped([50, 40]), seed=seed).sum() == 40
-    assert not drawn(grouped([10, 10]), kept=np.zeros(2, int), seed=0).any()
     assert not drawn(grouped([5] * 10), test_fraction=0.0).any()
     assert not drawn(grouped([9])).any()
 
@@ -247,8 +166,6 @@ def test_folds_are_dealt_from_the_largest_on():
     fold = draw_folds(groups, np.zeros(12, int), folds=2, seed=0)
     assert np.bincount(fold, weights=[1, 3, 5, 3]).tolist() == [6, 6]
     assert (fold[2], fold[1], fold[3], fold[0]) == (0, 1, 1, 0)
-    kept = np.array([UNDECIDED, UNDECIDED, 1, UNDECIDED])
-    assert draw_folds(groups, np.zeros(12, int), folds=2, seed=0, kept=kept).tolist() == [1, 0, 1, 0]
 
 
 def test_runs_are_groups_by_their_names():

@@ -22,7 +22,6 @@ from synthetic_store import (
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, StoreError, UsageError
-from tcpipe.formats.dataset_card import KeptSplit
 from tcpipe.formats.documents import State
 from tcpipe.formats.recipe_toml import make_recipe_id, parse_recipe
 from tcpipe.formats.runs import Call
@@ -435,24 +434,3 @@ def test_growth_takes_no_block_and_no_run_out_of_test(store, tmp_path, holdout):
     share = np.mean([split == "test" for split, _ in before.values()])
     assert 0.15 <= share <= 0.25
     assert {fold for _, fold in before.values()} == {0, 1, 2, 3, 4}
-
-
-@pytest.mark.parametrize("holdout", ["sample", "run"])
-def test_a_kept_split_moves_nothing_whatever_the_rules_are_now(store, tmp_path, holdout):
-    add(store)
-    add(store, "b", (3.0,), start_ns=10**15)
-    build(store, tmp_path, holdout="sample")
-    before = splits_by_id(tmp_path / "out")
-    add(store, "c", (-3.0, 6.0), start_ns=-(10**15))  # recorded before the others
-    region = region_file(tmp_path / "r.geojson", box(-20, -20, 2, 20))
-    result = build(store, tmp_path, holdout=holdout, seed=7, split=region, keep_split=tmp_path / "out", force=True)
-    now = splits_by_id(tmp_path / "out")
-    assert {sample: now[sample] for sample in before} == before
-    assert len(now) == 80
-    assert {"unseen", "buffer"} <= {split for sample, (split, _) in now.items() if sample.startswith("c-")}
-    assert open_dataset(result.path).card.split.kept == KeptSplit(40, 0)
-
-
-def test_a_split_to_keep_must_be_a_dataset(store, tmp_path):
-    add(store)
-    assert "there is no such directory" in refused(store, tmp_path, UsageError, keep_split=tmp_path / "nowhere")

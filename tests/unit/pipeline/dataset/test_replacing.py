@@ -133,11 +133,12 @@ def test_files_of_others_are_named_and_kept(here):
 
 
 def test_a_file_of_others_that_the_new_dataset_would_replace_is_kept(here):
-    (here / "dataset" / "excluded.csv").write_text("mine")
-    (here / "ids.csv").write_text("dry-0\n")
-    with pytest.raises(DatasetError, match="csv: has the name of a file of the new dataset; rename it"):
-        build_dataset(here / "dataset", **usual(here, exclude=here / "ids.csv", reason="mud", force=True))
-    assert (here / "dataset" / "excluded.csv").read_text() == "mine"
+    path = here / "dataset" / "data" / "train-00000-of-00001.parquet"
+    path.parent.mkdir()
+    path.write_text("mine")
+    with pytest.raises(DatasetError, match="has the name of a file of the new dataset; rename it"):
+        build_dataset(here / "dataset", **usual(here, file_format="parquet", force=True))
+    assert path.read_text() == "mine"
 
 
 CAUSES = {
@@ -148,7 +149,6 @@ CAUSES = {
     "order of maps": ({"map_name": ["site", "yard"]}, {"map_name": ["yard", "site"]}, ("order of maps: site, yard → yard, site",)),
     "map": ({"map_name": "site"}, {"map_name": "yard"}, ("map: added yard", "map: removed site", "order of maps: site → yard")),
     "region": ({"split": "region.geojson"}, {"split": "other.geojson"}, ("region: train_test is another one",)),
-    "kept split": ({}, {"keep_split": "dataset"}, ("kept split: added",)),
 }  # fmt: skip
 
 
@@ -159,9 +159,7 @@ def test_diff_names_every_input_that_differs(here, name):
     (here / "wet" / "soil.csv").write_text((here / "soil.csv").read_text().replace("0.2", "0.4"))
     *options, causes = CAUSES[name]
     for out, how in zip("ab", options, strict=True):
-        paths = {
-            key: here / value if key in ("covariates", "split", "keep_split") else value for key, value in how.items()
-        }
+        paths = {key: here / value if key in ("covariates", "split") else value for key, value in how.items()}
         build_dataset(here / out, **usual(here, **paths))
     found = diff(here / "a", here / "b")
     assert set(found.causes) == set(causes)
@@ -198,15 +196,6 @@ def test_another_robot_is_refused(here):
     add_run(store, "big", segments("big", *lanes(6.0, -10.0, 10.0), robot="warthog"), tags={"weather": "dry"})
     assert refused(here, robot="warthog") == ("--robot: husky in the dataset, warthog now",)
     assert build_dataset(here / "dataset", **usual(here, robot="husky")).status == "unchanged"
-
-
-def test_its_own_split_may_be_kept_and_then_has_to_be_asked_for(here):
-    out = here / "dataset"
-    shutil.copytree(out, here / "earlier")
-    assert refused(here, keep_split=here / "earlier") == ("--keep-split: no in the dataset, yes now",)
-    assert build_dataset(out, **usual(here, keep_split=out)).status == "done"
-    assert refused(here) == ("--keep-split: yes in the dataset, no now",)
-    assert build_dataset(out, **usual(here, keep_split=here / "earlier")).status in ("done", "unchanged")
 
 
 def reseal(directory: Path, **values: object) -> None:
