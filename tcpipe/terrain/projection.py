@@ -7,7 +7,6 @@ degrees, feet or Web Mercator. A CRS without an authority's code keeps the datum
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -191,14 +190,3 @@ def compute_area(crs: CRS, bounds: tuple[float, float, float, float]) -> tuple[f
     transformer = Transformer.from_crs(crs, CRS(crs.geodetic_crs), always_xy=True)
     west, south, east, north = transformer.transform_bounds(*bounds)
     return west, south, east, north
-
-
-def compute_geoid_height(lon_deg: float, lat_deg: float) -> float | None:
-    """Return how high the geoid is above the ellipsoid at a place [m], by EGM2008 or EGM96; None where PROJ has the grid of neither."""
-    for model in ("EPSG:4326+3855", "EPSG:4326+5773"):
-        with suppress(ProjError):
-            transformer = Transformer.from_crs(model, "EPSG:4979", always_xy=True, allow_ballpark=False)
-            height_m = float(transformer.transform(lon_deg, lat_deg, 0.0)[2])
-            if math.isfinite(height_m):
-                return height_m
-    return None

@@ -23,7 +23,7 @@ from tcpipe.stages.sample import Sampled, Shifts
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
-from tcpipe.terrain.projection import Projection, compute_geoid_height
+from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.registration import (
     REACH_M,
     HeightScale,
@@ -34,7 +34,7 @@ from tcpipe.terrain.sampling import find_classes_at
 from tcpipe.terrain.tiles import find_map_projection
 
 _COLUMNS = ["lon_deg", "lat_deg", "alt_m", "x_std_m", "y_std_m", "z_std_m"]
-_DATUM, _BLOCKED = "map-height-datum", "driven-not-traversable"
+_BLOCKED = "driven-not-traversable"
 
 
 def register_runs(
@@ -63,9 +63,6 @@ def register_runs(
         registrations.append(_make_map_registration(track.run_id, found, track.expected_m, is_applied=not reason))
         findings += _find_shift(found, track.run_id, source.name, is_applied=not reason)
         findings += _find_other_heights(found, track.expected_m, track.run_id, source.name)
-    if recipe.sample.align:
-        geoid_m = compute_geoid_height(*np.reshape(projection.area_deg, (2, 2)).mean(axis=0).tolist())
-        findings += _find_height_datum(registrations, source.name, geoid_m)
     return tuple(registrations), findings
 
 
@@ -166,19 +163,6 @@ def _find_other_heights(found: Registration, expected_m: float, run_id: str, nam
 
 def _is_other_ground(misfit_m: float, expected_m: float) -> bool:
     return misfit_m > read_threshold("map-heights-differ", "max_misfit_ratio") * expected_m
-
-
-def _find_height_datum(registrations: Sequence[MapRegistration], name: str, geoid_m: float | None) -> list[Finding]:
-    """Return the finding, if any, that heights of the tracks and of the map are above different surfaces."""
-    offsets_m = np.array([registration.height_offset_m for registration in registrations] or [0.0])
-    offset_m, apart_m = float(np.median(offsets_m)), read_threshold(_DATUM, "max_scatter_m")
-    if abs(offset_m) < read_threshold(_DATUM, "min_offset_m") or (np.abs(offsets_m - offset_m) > apart_m).any():
-        return []
-    reason = "probably ellipsoid against geoid"
-    if geoid_m is not None:
-        is_geoid = abs(abs(offset_m) - abs(geoid_m)) <= apart_m
-        reason = f"{'' if is_geoid else 'not '}ellipsoid against geoid ({geoid_m:.1f} m there)"
-    return [make_finding(_DATUM, Subject("map", name), names={"reason": reason}, offset_m=offset_m)]
 
 
 def _make_map_registration(run_id: str, found: Registration, expected_m: float, *, is_applied: bool) -> MapRegistration:

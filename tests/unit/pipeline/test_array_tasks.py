@@ -50,7 +50,7 @@ def drives(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(params=["directory", "bucket", "gateway"])
+@pytest.fixture(params=["directory", "gateway"])
 def root(request, tmp_path, monkeypatch):
     """Where a store is to be."""
     if request.param == "directory":

@@ -23,7 +23,6 @@ from tcpipe import open_dataset
 from tcpipe.errors import MapError
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.finding_lines import describe_finding
-from tcpipe.pipeline.dataset import map_checks
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.planning.drives import compute_drive_cost, evaluate_drives, find_drive
 from tcpipe.planning.path_files import choose_map
@@ -145,22 +144,6 @@ def test_a_shift_that_is_not_known_well_enough_is_not_applied(tmp_path, shift_m,
     assert refused.names["reason"].startswith(reason)
     assert not select_findings(found.findings, "map-aligned")
     assert found.card.maps[0].registration[0].applied_std_m is None
-
-
-@pytest.mark.parametrize(
-    ("geoid_m", "reason"),
-    [
-        (None, "probably ellipsoid against geoid"),
-        (45.0, "ellipsoid against geoid (45.0 m there)"),
-        (20.0, "not ellipsoid against geoid (20.0 m there)"),
-    ],
-)
-def test_heights_above_the_ellipsoid_are_recognised(tmp_path, monkeypatch, geoid_m, reason):
-    monkeypatch.setattr(map_checks, "compute_geoid_height", lambda lon, lat: geoid_m if 15 < lon < 16 < lat else 0.0)
-    found = build_with(tmp_path, track_at(winding(), winding()), ALIGN)
-    (said,) = select_findings(found.findings, "map-height-datum")
-    assert (said.subject, said.severity, said.names["reason"]) == (Subject("map", "site"), "note", reason)
-    assert said.numbers["offset_m"] == pytest.approx(GEOID_M, abs=0.1)
 
 
 HEIGHTS = ("map-heights-differ", "map-height-scale")
