@@ -82,7 +82,7 @@ def _option_records(context: click.Context) -> list[tuple[str, str]]:
     return [(re.sub("(INTEGER|FLOAT) RANGE", "NUMBER", names), _RANGE.sub("", text)) for names, text in records]
 
 
-_RANGE = re.compile(r"(; |  \[)[\d.e-]+<=?x<=?[\d.e+-]+(?=\])|(?<=\[)\]")
+_RANGE = re.compile(r"; [\d.e-]+<=?x<=?[\d.e+-]+(?=\])|  \[[\d.e-]+<=?x<=?[\d.e+-]+\]")
 """Range of a number in a help text."""
 
 
