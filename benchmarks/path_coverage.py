@@ -61,7 +61,7 @@ def make_store(place: Path, site: SimulatedSite, layers: Mapping[str, Path] | No
     store = place / "store"
     done = ingest(site.logs, store=store, recipe=replace(Recipe(), robot="husky"))
     assert done.exit_code == 0, "\n".join(problem for result in done.results for problem in result.problems)
-    add_map("site", store=store, layers=layers or {}, **site.rasters)
+    add_map("site", store=store, layer=layers or {}, **site.rasters)
     return store
 
 

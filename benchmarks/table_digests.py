@@ -146,7 +146,7 @@ def ingest_log(log: Path, store: Path, recipe: Path, tags: dict[str, str]) -> di
     """Ingest a log; return the exit status and the tables that came."""
     before = _find_tables(store)
     try:
-        status: Any = tcpipe.ingest([log], store=store, recipe=recipe, tags=tags).exit_code
+        status: Any = tcpipe.ingest([log], store=store, recipe=recipe, tag=tags).exit_code
     except Exception as error:  # noqa: BLE001  whatever it is, it stands in the comparison
         traceback.print_exception(error, limit=-1)
         status = "error"

@@ -1,4 +1,4 @@
-"""Write docs/reference/{cli,columns,documents,findings,recipe,robots}.md, stable.json and schemas/ from the code; tests compare."""
+"""Write docs/reference/{cli,columns,documents,findings,python,recipe,robots}.md, stable.json and schemas/ from the code; tests compare."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import json
 import re
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import IntFlag
 from importlib.resources import files
@@ -20,6 +20,7 @@ import click
 from contracts import DOCUMENTS, json_output_types, make_contracts
 from stable import FILE, describe_stable, find_lost_names
 
+import tcpipe
 from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles
@@ -48,6 +49,7 @@ def pages() -> dict[str, str]:
         "columns.md": _columns(),
         "documents.md": _documents(),
         "findings.md": _findings(),
+        "python.md": _python(),
         "recipe.md": _recipe(),
         "robots.md": _robots(),
         FILE.name: json.dumps(describe_stable(), indent=1, ensure_ascii=False) + "\n",
@@ -65,6 +67,48 @@ def _cli() -> str:
         parts.append(f"## Options of several commands\n\n{_COMMON}\n```\n{_format_options(parent, shared)}```\n")
         parts += [_describe_command(context, shared) for context in contexts]
     return "\n".join(parts)
+
+
+_PYTHON = """# Python functions
+
+A keyword has the name and meaning of the command's [option](cli.md); times are seconds, lengths metres, energies joules.
+An unknown keyword is a `TypeError` that names the right one; all other errors are `tcpipe.errors.TcpipeError` ([errors](errors.md)).
+`str` of a result is what the command prints. Runs, datasets and evaluations are tables in a notebook ([example](../notebook.ipynb)).
+
+## A pipeline in ten lines
+
+After `tcpipe simulate site`, or with your own files:
+
+```python
+import tcpipe
+
+tcpipe.ingest(["site/logs"], store="store")
+maps = {layer: f"site/maps/{layer}.tif" for layer in ("height", "ortho", "terrain")}
+tcpipe.add_map("farm", **maps, classes="site/maps/classes.csv", store="store")
+tcpipe.build_dataset("dataset", split="site/region.geojson", store="store")
+dataset = tcpipe.open_dataset("dataset")
+patches, labels = dataset["train"].patches, dataset["train"].labels
+tcpipe.train("dataset", "model", model="linear")
+evaluation = tcpipe.evaluate("model", "dataset", "evaluation")
+plan = tcpipe.plan_path("model", (17.59943, 46.99977), (17.60001, 47.0), store="store")
+```
+"""
+
+
+def _python() -> str:
+    """Return each public function with its signature and keywords."""
+    functions = [(name, getattr(tcpipe, name)) for name in tcpipe.__all__ if callable(getattr(tcpipe, name))]
+    return "\n".join([_NOTE, _PYTHON, *(_describe_function(name, function) for name, function in functions)])
+
+
+def _describe_function(name: str, function: Callable[..., object]) -> str:
+    signature = inspect.signature(function)
+    parameters = [str(each.replace(annotation=each.empty)) for each in signature.parameters.values()]
+    names = [each.name for each in signature.parameters.values() if each.kind is each.KEYWORD_ONLY]
+    if names:
+        parameters.insert(len(parameters) - len(names), "*")
+    text = inspect.cleandoc(function.__doc__ or "").partition("Parameters\n----------\n")[0].replace("``", "`").strip()
+    return f"## tcpipe.{name}\n\n```python\n{name}({', '.join(parameters)})\n```\n\n{text}\n"
 
 
 _COMMON = "`tcpipe COMMAND --help` prints more, which of these options a command has, and the range of each number.\n"

@@ -88,7 +88,7 @@ def _make_hill(source: MapReader, bounds: Bounds) -> Array:
     grey = layers["ortho"] / 255.0 if "ortho" in layers else np.full(light.shape, 0.7)
     picture = np.repeat(grey[..., None], 3, axis=2)
     if "terrain" in layers:
-        picture = 0.45 * picture + 0.55 * colour_classes(layers["terrain"].astype(np.int64)) / 255.0
+        picture = 0.45 * picture + 0.55 * colour_classes(layers["terrain"], level.layers["terrain"].classes) / 255.0
     picture = np.clip(picture * (0.45 + 0.75 * light / 255.0)[..., None], 0.0, 1.0)
     return np.where((is_missing | ~np.isfinite(layers["height"]))[..., None], 1.0, picture)
 

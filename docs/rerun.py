@@ -96,10 +96,9 @@ def run_script(script: str, *, cwd: Path, env: Mapping[str, str]) -> str:
 
 
 def _trim_output(output: str) -> str:
-    """Return output as whole lines without trailing blanks, and without the one-time line about compiling."""
-    lines = [
-        line.rstrip() for line in output.strip("\n").splitlines() if not line.startswith("compiling numeric kernels")
-    ]
+    """Return output as whole lines without trailing blanks, the line about compiling, and the next step (a page names its own)."""
+    left_out = ("compiling numeric kernels", "next: ")
+    lines = [line.rstrip() for line in output.strip("\n").splitlines() if not line.startswith(left_out)]
     return "".join(f"{line}\n" for line in lines)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 __version__ = "2.0.0.dev2"
 
 _HOMES = {
-    "read_log": ("tcpipe.formats.logs.log_joining", "open_single_log"),
+    "read_log": ("tcpipe.api", "read_log"),
     "ingest": ("tcpipe.pipeline.ingest", "ingest"),
     "add_map": ("tcpipe.pipeline.maps", "add_map"),
     "build_dataset": ("tcpipe.pipeline.dataset.build", "build_dataset"),

@@ -1,7 +1,6 @@
 from tcpipe import errors
-from tcpipe.api import evaluate, plan_path, predict_path, train
+from tcpipe.api import evaluate, plan_path, predict_path, read_log, train
 from tcpipe.dataset import open_dataset
-from tcpipe.formats.logs.log_joining import open_single_log as read_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map

@@ -1,4 +1,4 @@
-"""The commands `train`, `evaluate`, `predict-path` and `plan-path` as functions; their options are keywords.
+"""The function `read_log`, and the commands `train`, `evaluate`, `predict-path` and `plan-path` as functions; their options are keywords.
 
 A function imports what it needs when it is called: a model of physics needs no plots, and a path no evaluation.
 """
@@ -14,10 +14,22 @@ from tcpipe.planning.path_options import PlanPathOptions, PredictPathOptions
 from tcpipe.tables.options import as_function
 
 if TYPE_CHECKING:
+    from tcpipe.formats.logs.log_file import Log
+    from tcpipe.formats.logs.message_tables import TableLog
     from tcpipe.learning.evaluation_files import EvaluationResult
     from tcpipe.learning.training import TrainResult
     from tcpipe.planning.drives import DrivesResult
     from tcpipe.planning.path_files import PathResult, PlanResult
+
+
+def read_log(path: str | Path, *, msgdef: str | Path | None = None) -> Log | TableLog:
+    """Open a log: ``topics``, ``table(topic)``, ``tables(topics)``, ``damage``; a damaged log gives what is intact.
+
+    Raises `LogError`: the path is no log. ``msgdef`` is a directory of definitions of types that the log does not define.
+    """
+    from tcpipe.formats.logs.log_joining import open_single_log
+
+    return open_single_log(path, message_definitions=None if msgdef is None else Path(msgdef))
 
 
 def run_train(options: TrainOptions) -> TrainResult:
@@ -56,7 +68,7 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     `StoreError` where an input cannot be used.
     """
     model, dataset, out, store = options.model, options.dataset, options.out, options.store
-    if options.drives:
+    if options.drive:
         from tcpipe.dataset import open_dataset
         from tcpipe.learning.models import load_model
         from tcpipe.planning.drives import check_origin, evaluate_drives
@@ -64,10 +76,10 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
 
         loaded, source, data = (
             load_model(model, options.predictor),
-            choose_map(store, options.map_name),
+            choose_map(store, options.map),
             open_dataset(dataset),
         )
-        logs = [*map(str, options.drives)]
+        logs = [*map(str, options.drive)]
         check_origin(loaded, data)
         return evaluate_drives(loaded, data, source, logs, store=store, out=out)
     from tcpipe.learning.evaluation import EvaluateConfig
@@ -93,8 +105,8 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     from tcpipe.planning.path_files import choose_map
     from tcpipe.planning.path_files import predict_path as run
 
-    source = choose_map(options.store, options.map_name)
-    asked = choose_model(options.model, speed_mps=options.speed_mps, predictor=options.predictor)
+    source = choose_map(options.store, options.map)
+    asked = choose_model(options.model, speed_mps=options.speed, predictor=options.predictor)
     known = None
     if options.adapt is not None:
         from tcpipe.planning.drives import collect_runs
@@ -116,8 +128,8 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     from tcpipe.learning.models import choose_model
     from tcpipe.planning.path_files import choose_map, plan
 
-    asked = choose_model(options.model, speed_mps=options.speed_mps, predictor=options.predictor)
-    return plan(asked, choose_map(options.store, options.map_name), options)
+    asked = choose_model(options.model, speed_mps=options.speed, predictor=options.predictor)
+    return plan(asked, choose_map(options.store, options.map), options)
 
 
 plan_path = as_function(PlanPathOptions, run_plan_path)

@@ -37,4 +37,4 @@ def drive_at(path: Path, **how) -> Path:
 
 def ask_status(store, *logs, **how):
     """Return the status of logs, or of those that were ingested before."""
-    return find_status(IngestOptions(logs, store=store, **{"recipe": Recipe(), "min_age_s": 600.0, **how}))
+    return find_status(IngestOptions(logs, store=store, **{"recipe": Recipe(), "min_age": 600.0, **how}))

@@ -16,49 +16,90 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
-from typing import Any, NoReturn, TypeVar
+from itertools import chain
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from tcpipe import __version__
-from tcpipe.cli.output import Failure, print_failure, print_traceback, write_debug_log
+from tcpipe.cli.output import NEXT_STEP, Failure, print_failure, print_line, print_traceback, write_debug_log
 from tcpipe.errors import TcpipeError, UsageError, hide_secrets
 
 _EXTRAS = {"torch": "train", "lightgbm": "tables", "dask": "cluster", "distributed": "cluster", "dagster": "dagster"}
 """Which extra brings a package that only some commands need."""
 
 C = TypeVar("C", bound=Callable[..., Any])
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
-_COMMANDS = {
-    "demo": ("site_commands", "Run all commands on a simulated site"),
-    "init": ("site_commands", "Write a commented recipe"),
-    "inspect": ("inspect", "List the contents of a log, map, dataset or store"),
-    "preflight": ("log_commands", "Check a short test recording before a campaign"),
-    "ingest": ("log_commands", "Convert logs to labelled 1 m segments"),
-    "audit": ("log_commands", "Judge a track by fixes withheld from it"),
-    "status": ("log_commands", "List the state and problems of every log"),
-    "acknowledge": ("log_commands", "Do not report known problems again"),
-    "prune": ("log_commands", "Remove what a store no longer needs"),
-    "add-map": ("dataset_commands", "Add the rasters of a site to the store"),
-    "build-dataset": ("dataset_commands", "Build a dataset from segments and maps"),
-    "train": ("model_commands", "Train a model on a dataset"),
-    "evaluate": ("model_commands", "Evaluate a model and compare it with the paper"),
-    "benchmark": ("model_commands", "Compare all kinds of model on datasets"),
-    "reproduce": ("model_commands", "Repeat the paper's experiment on a simulated site"),
-    "predict-path": ("model_commands", "Predict time and energy of a path"),
-    "cost-map": ("model_commands", "Compute directional cost maps of a whole map"),
-    "plan-path": ("model_commands", "Plan the path of least energy, time or distance"),
-    "route-graph": ("model_commands", "Write costs into a Nav2 route graph"),
-    "report": ("dataset_commands", "Write the HTML page of a run, dataset or store"),
-    "overlay": ("log_commands", "Write a run as MCAP, to view with its log"),
-    "export": ("dataset_commands", "Export topics as Parquet"),
-    "explain": ("dataset_commands", "Trace a sample to its log"),
-    "verify": ("dataset_commands", "Read all files again, compare counts and checksums"),
-    "diff": ("dataset_commands", "List the differences of two datasets, by cause"),
-    "simulate": ("site_commands", "Write a simulated site with its true values"),
+_GROUPS = {
+    "Start": {
+        "demo": ("site_commands", "Run all commands on a simulated site"),
+        "init": ("site_commands", "Write a commented recipe"),
+        "inspect": ("inspect", "List the contents of a log, map, dataset or store"),
+        "preflight": ("log_commands", "Check a short test recording before a campaign"),
+    },
+    "From logs to a dataset": {
+        "ingest": ("log_commands", "Convert logs to labelled 1 m segments"),
+        "status": ("log_commands", "List the state and problems of every log"),
+        "acknowledge": ("log_commands", "Do not report known problems again"),
+        "add-map": ("dataset_commands", "Add the rasters of a site to the store"),
+        "build-dataset": ("dataset_commands", "Build a dataset from segments and maps"),
+        "prune": ("log_commands", "Remove what a store no longer needs"),
+    },
+    "Look and check": {
+        "report": ("dataset_commands", "Write the HTML page of a run, dataset or store"),
+        "overlay": ("log_commands", "Write a run as MCAP, to view with its log"),
+        "export": ("dataset_commands", "Export topics as Parquet"),
+        "audit": ("log_commands", "Judge a track by fixes withheld from it"),
+        "explain": ("dataset_commands", "Trace a sample to its log"),
+        "verify": ("dataset_commands", "Read all files again, compare counts and checksums"),
+        "diff": ("dataset_commands", "List the differences of two datasets, by cause"),
+    },
+    "Models and plans": {
+        "train": ("model_commands", "Train a model on a dataset"),
+        "evaluate": ("model_commands", "Evaluate a model and compare it with the paper"),
+        "benchmark": ("model_commands", "Compare all kinds of model on datasets"),
+        "predict-path": ("model_commands", "Predict time and energy of a path"),
+        "plan-path": ("model_commands", "Plan the path of least energy, time or distance"),
+        "cost-map": ("model_commands", "Compute directional cost maps of a whole map"),
+        "route-graph": ("model_commands", "Write costs into a Nav2 route graph"),
+        "simulate": ("site_commands", "Write a simulated site with its true values"),
+        "reproduce": ("model_commands", "Repeat the paper's experiment on a simulated site"),
+    },
 }
-"""The module and the purpose of each command, in the order a user meets them; the command NAME-X is the function NAME_X there."""
+"""The module and purpose of each command, in groups, in the order a user meets them; the command NAME-X is the function NAME_X there."""
+_NEXT_STEPS = {
+    "demo": "tcpipe train {directory}/dataset",
+    "preflight": "tcpipe ingest {log}",
+    "ingest": "tcpipe report{store}, then tcpipe add-map or tcpipe build-dataset{store}",
+    "status": "tcpipe report{store}",
+    "acknowledge": "tcpipe status{store}",
+    "add-map": "tcpipe build-dataset --split REGION.geojson{store}",
+    "build-dataset": "tcpipe report {out}, then tcpipe train {out}",
+    "prune": "tcpipe status{store}",
+    "report": "open the first page in a browser",
+    "overlay": "open {out} and its log in Foxglove",
+    "export": "read {out} with pandas, polars or DuckDB",
+    "audit": "tcpipe report{store}",
+    "explain": "tcpipe report {dataset} shows its patch and map",
+    "verify": "tcpipe diff A B compares two datasets",
+    "diff": "tcpipe explain SAMPLE_ID --dataset {b}",
+    "train": "tcpipe evaluate {out} {dataset}",
+    "evaluate": "tcpipe predict-path {model} --path PATH.geojson{store}",
+    "benchmark": "open {out}/benchmark.html",
+    "predict-path": "tcpipe plan-path {model} --from LON,LAT --to LON,LAT{store}",
+    "plan-path": "tcpipe predict-path {model} --path {out}{store}",
+    "cost-map": "tcpipe plan-path {model} --cost-map {out} --from LON,LAT --to LON,LAT{store}",
+    "route-graph": "load {out} into the route server of Nav2",
+    "simulate": "tcpipe ingest {out}/logs",
+    "reproduce": "open {directory}/reproduction.html",
+}
+"""Next step after the success of a command; the parameters of its call fill the braces."""
+_WIDTH = max(map(len, chain.from_iterable(_GROUPS.values())))
+_COMMANDS = {name: entry for group in _GROUPS.values() for name, entry in group.items()}
 
 
 class _Commands(Mapping[str, click.Command]):
@@ -78,7 +119,25 @@ class _Commands(Mapping[str, click.Command]):
 def _load(name: str, module: str, about: str) -> click.Command:
     command: click.Command = getattr(import_module(f"tcpipe.cli.{module}"), name.replace("-", "_"))
     command.short_help = about
+    if command.callback:
+        command.callback = _name_next_step(_NEXT_STEPS.get(name, ""), command.callback)
     return _debug_option(hidden=True)(command)
+
+
+def _name_next_step(text: str, run: Callable[P, R]) -> Callable[P, R]:
+    """Return a command that prints on stderr what to do after its success; it may replace the text (`NEXT_STEP`)."""
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        code, context = run(*args, **kwargs), click.get_current_context()
+        given = {name: shlex.quote(str(value)) for name, value in context.params.items()}
+        is_named = context.get_parameter_source("store") is ParameterSource.COMMANDLINE
+        store = f" --store {given['store']}" if is_named else ""
+        step = context.meta.get(NEXT_STEP, text).format(**given | {"store": store})
+        if step and not (code or context.params.get("as_json") or context.params.get("quiet")):
+            print_line(f"next: {step}", err=True)
+        return code
+
+    return call
 
 
 class _Group(click.Group):
@@ -92,8 +151,9 @@ class _Group(click.Group):
         return list(self.commands)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002  click's signature
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, about) for name, (_, about) in _COMMANDS.items()])
+        for title, group in _GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name.ljust(_WIDTH), about) for name, (_, about) in group.items()])
 
 
 def _begin_debugging(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001  click's signature
@@ -136,6 +196,10 @@ def cli() -> None:
 _NOTHING_HALF = "no output is incomplete; run the same command again"
 _LATEST_S = 4.0
 """Longest time for an orderly end [s]: a library that waits for a network or computes passes no signal to Python."""
+
+
+_RECEIVED = list[int]()
+"""Signals that ask this call to end; an import that one interrupts may fail with another error."""
 
 
 class Terminated(BaseException):
@@ -191,6 +255,7 @@ def _watch(read_end: int) -> None:
             return
         if not ending and received[0] in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             end, ending = time.monotonic() + _LATEST_S, received[0]
+            _RECEIVED.append(ending)
         left_s = max(0.0, end - time.monotonic()) if ending else None
     failure = Failure(128 + ending, (f"{Terminated(ending)}; {_NOTHING_HALF}",), transient=True)
     print_failure(failure, as_json="--json" in sys.argv)
@@ -226,6 +291,7 @@ def main() -> None:
 
 @terminate_on_signal()
 def _run() -> NoReturn:
+    _RECEIVED.clear()
     try:
         _refuse_empty(sys.argv[1:])
         code = cli.main(prog_name="tcpipe", standalone_mode=False)
@@ -249,6 +315,9 @@ def _run() -> NoReturn:
         where = f"{error.filename}: " if error.filename else ""
         _fail([f"{where}{error.strerror or error}"], 1, error)
     except Exception as error:  # noqa: BLE001  the last resort
+        time.sleep(0.05)  # until the thread that watches for signals has run
+        if _RECEIVED:
+            _fail([f"{Terminated(_RECEIVED[0])}; {_NOTHING_HALF}"], 128 + _RECEIVED[0], error)
         _fail([_describe_unforeseen(error)], 1, error)
     sys.exit(code if isinstance(code, int) else 0)
 

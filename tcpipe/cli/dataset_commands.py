@@ -88,13 +88,8 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
 @click.option(
     "--no-runs", is_flag=True, help="For a store: write only its own page, with links to existing pages of runs."
 )
-@click.option(
-    "--patches",
-    is_flag=True,
-    help="For a dataset: write images of all patches to a folder next to the page, and show them.",
-)
 @recipe_option
-def report(path: str, *, store: str, no_runs: bool, patches: bool, recipe: str | None) -> None:
+def report(path: str, *, store: str, no_runs: bool, recipe: str | None) -> None:
     """Write report.html for PATH, a dataset or a store, or for RUN or RUN/RECIPE of the store; and print the robots' physics.
 
     Without an argument: for the store and all of its runs. The page of the store sums over the runs of the current recipe. A page needs no
@@ -103,7 +98,7 @@ def report(path: str, *, store: str, no_runs: bool, patches: bool, recipe: str |
     from tcpipe.pipeline.report import report as run
 
     ruling = resolve_recipe_with_source(recipe)[0]
-    written = run(path, store=store, recipe=ruling, runs=not no_runs, patches=patches)
+    written = run(path, store=store, recipe=ruling, runs=not no_runs)
     for page in written:
         print_line(page.path)
         for line in page.physics:

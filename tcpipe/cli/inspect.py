@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import click
 
 from tcpipe.cli.options import add_path_or_run, json_option, msgdef_option, recipe_option, robot_option
-from tcpipe.cli.output import print_json, print_line, print_lines, resolve_recipe_with_source
+from tcpipe.cli.output import NEXT_STEP, print_json, print_line, print_lines, resolve_recipe_with_source
 
 if TYPE_CHECKING:
-    from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore, InspectedTables
+    from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
     from tcpipe.pipeline.log_inspection import InspectedLog, InspectedTopic
     from tcpipe.tables.findings import Finding
@@ -41,6 +41,7 @@ def inspect(
         print_json(found)
     else:
         _PRINTERS[found.kind](found)
+    click.get_current_context().meta[NEXT_STEP] = _NEXT_STEPS[found.kind]
     return _exit_code((found,)) if found.kind == "log" else _exit_code(found.logs) if found.kind == "logs" else 0
 
 
@@ -228,10 +229,6 @@ def _print_run(found: InspectedRun) -> None:
         _print_damage("damage", run.damage)
 
 
-def _print_tables(found: InspectedTables) -> None:
-    print_lines(found.recipe.rstrip())
-
-
 def _format_answer(value: object) -> str:
     return "" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)
 
@@ -242,10 +239,19 @@ def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         print_line("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
+_NEXT_STEPS = {
+    "log": "tcpipe ingest {path}",
+    "logs": "tcpipe ingest {path}",
+    "tables": "tcpipe init --from {path}",
+    "map": "tcpipe build-dataset",
+    "dataset": "tcpipe report {path}",
+    "run": "tcpipe report {path}{store}",
+    "store": "tcpipe build-dataset --store {path}",
+}
 _PRINTERS: dict[str, Callable[..., None]] = {
     "log": _print_log,
     "logs": _print_logs,
-    "tables": _print_tables,
+    "tables": lambda found: print_lines(found.recipe.rstrip()),
     "map": _print_map,
     "dataset": _print_dataset,
     "run": _print_run,

@@ -243,7 +243,7 @@ def status(
     elif paths and not is_url(store) and not Path(store).exists():
         raise UsageError(f"{paths[0]}: no store here and none at {store}; name one with --store")
     ruling = resolve_recipe_with_source(recipe)[0]
-    found = run(IngestOptions(paths, store=store, recipe=ruling, robot=robot, min_age_s=min_age_s))
+    found = run(IngestOptions(paths, store=store, recipe=ruling, robot=robot, min_age=min_age_s))
     if as_json:
         print_json(found)
         return found.exit_code

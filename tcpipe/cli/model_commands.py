@@ -177,8 +177,8 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
         result = make_cost_map(
             *_load_inputs(options),
             options.out,
-            cell_size_m=options.cell_size_m,
-            origin_deg=options.origin_deg,
+            cell_size_m=options.cell_size,
+            origin_deg=options.origin,
             step=shown.count,
         )
     print_result(result, as_json=as_json)
@@ -189,8 +189,8 @@ def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[Model, Ma
     from tcpipe.learning.models import choose_model
     from tcpipe.planning.path_files import choose_map
 
-    source = choose_map(options.store, options.map_name)
-    return choose_model(options.model, speed_mps=options.speed_mps, predictor=options.predictor), source
+    source = choose_map(options.store, options.map)
+    return choose_model(options.model, speed_mps=options.speed, predictor=options.predictor), source
 
 
 @click.command("plan-path")
@@ -227,7 +227,7 @@ def route_graph(options: RouteGraphOptions, *, as_json: bool, quiet: bool) -> in
             *_load_inputs(options),
             Path(options.out),
             graph=Path(options.graph),
-            origin_deg=options.origin_deg,
+            origin_deg=options.origin,
             two_way=options.two_way,
         )
     print_result(result, as_json=as_json)

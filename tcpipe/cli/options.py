@@ -295,7 +295,8 @@ def add_path_or_run(name: str, metavar: str, *, required: bool) -> Option:
             given = values[name]
             if given and is_path(given) and context.get_parameter_source("store") is ParameterSource.COMMANDLINE:
                 raise UsageError(f"{given}: is a path, and --store is where a run is looked up; give one of them")
-            return run(store=store, **{**values, name: given or store})
+            values[name] = context.params[name] = given or store
+            return run(store=store, **values)
 
         declared: Callable[..., Any] = click.argument(name, type=PATH_OR_RUN, required=required, metavar=metavar)(
             store_option(command)

@@ -71,6 +71,9 @@ def _open_terminal(*, as_json: bool) -> Console | None:
     return console if console.is_terminal and not console.is_dumb_terminal else None
 
 
+NEXT_STEP = "tcpipe.next_step"
+"""Key of click's context for what to do after a command, where its result decides."""
+
 _LONGEST_NAME = 40
 
 
@@ -83,6 +86,7 @@ class Progress:
         self._stages: dict[str, str] = {}
         self._sizes: Mapping[str, int] = {}
         self._waiting, self._done, self._begun_s = 0, 0, time.monotonic()
+        self._part: int | None = None
         self._bars: rich.progress.Progress | None = None
         if console is None:
             return
@@ -149,9 +153,20 @@ class Progress:
         elif done * 10 // total > (done - 1) * 10 // total:
             self.line(f"{self._what}: {100 * done // total} %")
 
+    def begin_part(self, number: int, total: int, text: str) -> None:
+        """Fill the bar to part ``number`` of ``total``; the steps of the part fill it further. Without bars a line."""
+        if self._bars is None:
+            self.line(text)
+        else:
+            self._part = number
+            self._bars.update(self._all, total=total, completed=number, said=text)
+
     def step(self, step: Step) -> None:
         """Show how far a log is; without bars a line at each of its stages."""
-        if self._bars is not None and step.task:
+        if self._bars is not None and self._part is not None:
+            share = step.done / step.total if step.total else 0.0
+            self._bars.update(self._all, completed=self._part + share, said=step.stage)
+        elif self._bars is not None and step.task:
             name = clean_line(step.task.rsplit("/", 1)[-1])[-_LONGEST_NAME:]
             size = f" {_format_megabytes(step.done)} of {_format_megabytes(step.total)} MB" if step.total else ""
             self._draw(self._bars, f"; {name}: {step.stage}{size}")

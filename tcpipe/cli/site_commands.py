@@ -32,7 +32,7 @@ def demo(directory: str, *, seed: int, quiet: bool) -> None:
     from tcpipe.pipeline.demo import run_demo
 
     with show_progress("demo", quiet=quiet) as shown:
-        result = run_demo(Path(directory), seed=seed, say=shown.line)
+        result = run_demo(Path(directory), seed=seed, begin_part=shown.begin_part)
     print_lines(result)
 
 
@@ -64,8 +64,7 @@ def init(directory: str, *, source: str | None, robot: str | None, msgdef: str |
     else:
         write_text(path, text)
         print_line(f"wrote {path}")
-    if proposed:
-        print_lines(proposed.describe_next_step(path))
+    print_lines(proposed.describe_next_step(path) if proposed else "then: tcpipe ingest LOG")
 
 
 @click.command()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +21,7 @@ from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
 from tcpipe.errors import DatasetError, list_first
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
+    OVERVIEW,
     find_places_in_files,
     is_shard,
     open_patches,
@@ -28,6 +31,7 @@ from tcpipe.formats.dataset_files import (
     sample_columns,
 )
 from tcpipe.formats.published_outputs import fetch_directory_by_range
+from tcpipe.formats.runs import format_html_table
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.levels import LABELS
@@ -359,6 +363,19 @@ class Dataset(Mapping[str, Split]):
         """Name the dataset and its splits."""
         counts = ", ".join(f"{name} {len(split)}" for name, split in self._splits.items())
         return f"Dataset({str(self.path)!r}: {counts})"
+
+    def _repr_html_(self) -> str:
+        """Return the samples of each split by terrain, and the small picture of the map, for notebooks."""
+        names = sorted({name for counts in self.card.terrain.values() for name in counts})
+        rows = [
+            [name, str(len(split)), *(str(self.card.terrain[name].get(ground, 0)) for ground in names)]
+            for name, split in self._splits.items()
+        ]
+        table = format_html_table(f"Dataset {self.path}", rows, ("split", "samples", *names))
+        with suppress(OSError):
+            picture = base64.b64encode((self.path / OVERVIEW).read_bytes()).decode()
+            return f'{table}<img src="data:image/png;base64,{picture}" style="max-height:20em" alt="map">'
+        return table
 
 
 def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label: str = "total") -> Dataset:

@@ -4,7 +4,6 @@
 
     dataset.json  croissant.json  samples.parquet  report.html
     overview.png  relief.png  classes.png                    the map, small, as the report shows it
-    report-patches/                                          pictures of all patches, after `tcpipe report --patches`
     patches.zarr/{ortho,terrain,height,sample_id}            --format zarr
     data/<split>-00000-of-00001.parquet                      --format parquet: the same layers, a row a sample
 """
@@ -32,7 +31,7 @@ from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_table, write_parquet_bytes
 from tcpipe.formats.place import REPORT, Place, find_changed_files, prove_files
-from tcpipe.formats.published_outputs import REPORT_PATCHES, FetchedShards
+from tcpipe.formats.published_outputs import FetchedShards
 from tcpipe.formats.zarr_arrays import (
     DESCRIPTION,
     Compression,
@@ -292,7 +291,7 @@ def find_foreign_files(directory: Path, checksums: Collection[str]) -> list[str]
     """Return the files in the directory of a dataset that tcpipe did not write; ``checksums`` are the names that its card lists."""
     files = (path for path in directory.rglob("*") if path.is_symlink() or not path.is_dir())
     names = {path.relative_to(directory).as_posix() for path in files} - {*checksums, CARD, REPORT}
-    return sorted(name for name in names if not name.startswith(f"{REPORT_PATCHES}/"))
+    return sorted(names)
 
 
 def keep_foreign_files(names: Iterable[str], before: Path, directory: Path) -> None:

@@ -33,8 +33,6 @@ from tcpipe.formats.place import REPORT, FileEntry, Place, find_changed_files, o
 
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents with the checksums of all files beside them."""
-REPORT_PATCHES = "report-patches"
-"""Folder of pictures that a dataset's page shows; no card lists them."""
 BUILDS = "builds"
 _BUILD = re.compile(rf"({BUILDS}/[0-9a-f]{{16}})/")
 _POINTER = re.compile(r"current\.(\d+)\.([0-9a-f]{16})\.json")
@@ -154,7 +152,7 @@ def find_unlisted_files(url: str) -> list[str]:
 
     def is_expected(name: str) -> bool:
         build = _BUILD.match(name)
-        return name in others or f"/{REPORT_PATCHES}/" in f"/{name}" or bool(build and build[1] not in unexpected)
+        return name in others or bool(build and build[1] not in unexpected)
 
     unlisted = (name for name, *_ in entries if place.where(name) not in listed)
     return [place.where(name) for name in unlisted if not is_expected(name)]

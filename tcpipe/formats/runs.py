@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
+from html import escape
 from typing import Literal, TypeAlias
 
+from tcpipe.errors import clean_line
 from tcpipe.formats.integrity import Checksum
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFit, StageFacts
 from tcpipe.tables.findings import (
+    AFFECTED,
     LEFT_OUT,
     Finding,
     StageReport,
@@ -264,6 +267,8 @@ class RunFacts:
     """Findings of all stages."""
     damage: tuple[Finding, ...] = ()
     """Findings about damage to the log."""
+    energy_joule: float | None = None
+    """Energy of the whole drive, also outside segments [J]; None without power."""
     energy_budget: EnergyBudget | None = None
     idle_watt: float | None = None
     physics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -292,9 +297,27 @@ class RunFacts:
         return self.distance_by_reason_m.get(KEPT, 0.0)
 
     @property
+    def wh_per_km(self) -> float | None:
+        """Energy of the whole drive over its distance [Wh/km]; None without power, or of a robot that did not move."""
+        return None if self.energy_joule is None or not self.driven_m else self.energy_joule / 3.6 / self.driven_m
+
+    @property
     def verdict(self) -> Verdict:
         """The verdict on its findings by the catalogue of this version."""
         return judge(self.findings)
+
+    def _repr_html_(self) -> str:
+        """Return distance, energy and verdict as a table for notebooks."""
+        energy, wh_per_km = self.energy_joule, self.wh_per_km
+        rows = [
+            ("robot", self.robot),
+            ("segments", self.segments),
+            ("driven", f"{self.driven_m:.0f} m, {self.kept_m:.0f} m of it in segments"),
+            ("energy", "no power" if energy is None else f"{energy / 3600:.1f} Wh"),
+            *([("energy per distance", f"{wh_per_km:.1f} Wh/km")] if wh_per_km is not None else []),
+            *((name, getattr(self.verdict, name)) for name in AFFECTED),
+        ]
+        return format_html_table(f"Run {self.run_id}", rows)
 
     @property
     def is_empty(self) -> bool:
@@ -342,6 +365,15 @@ def strip_repeated(run: Run) -> Run:
     """Return a run as it is written: each finding once, without what other documents decide."""
     report = replace(run.info.report, findings=())
     return replace(run, info=replace(run.info, report=report), tags={}, superseded_by=None)
+
+
+def format_html_table(title: str, rows: Iterable[Sequence[str | float]], header: Sequence[str] = ()) -> str:
+    """Return a table of texts and numbers as HTML, as notebooks show results; each text is escaped."""
+    lines = [f"<caption><b>{escape(clean_line(title))}</b></caption>"]
+    for tag, row in (*([("th", header)] if header else []), *(("td", row) for row in rows)):
+        cells = (f"<{tag} style='text-align:left'>{escape(clean_line(str(cell)))}</{tag}>" for cell in row)
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    return f"<table>{''.join(lines)}</table>"
 
 
 def restore_repeated(run: Run, facts: RunFacts) -> Run:

@@ -28,6 +28,7 @@ from tcpipe.formats.published_outputs import (
     open_output,
     require_card,
 )
+from tcpipe.formats.runs import format_html_table
 from tcpipe.learning.baselines import describe_ratios
 from tcpipe.learning.evaluation import UNKNOWN_DISTANCE, EvaluateConfig, Evaluation, evaluate
 from tcpipe.learning.evaluation_page import render_evaluation_page
@@ -67,6 +68,24 @@ class EvaluationResult:
         lines += [f"verdict: {line}" for line in list_verdict(self.values.verdict, self.values.judged)]
         lines += format_findings(self.values.findings)
         return clean_lines((*lines, f"open {self.path}/{PAGE}"))
+
+    def _repr_html_(self) -> str:
+        """Return the errors of all classes together as a table for notebooks."""
+        rows = [
+            (
+                split,
+                quantity,
+                error.count,
+                f"{error.rmse or float('nan'):.3g}",
+                f"{error.mape_percent or float('nan'):.1f} %",
+            )
+            for split, part in self.values.splits.items()
+            for quantity, errors in part.errors.items()
+            for error in (errors[ALL],)
+        ]
+        header = ("split", "quantity", "samples", "RMSE", "MAPE")
+        verdict = [("verdict", line) for line in list_verdict(self.values.verdict, self.values.judged)]
+        return format_html_table(f"Evaluation {self.path}", rows, header) + format_html_table("", verdict)
 
 
 def run_evaluation(

@@ -23,7 +23,7 @@ from tcpipe.learning.predictions import (
     make_column_name,
 )
 from tcpipe.learning.predictor import find_kind
-from tcpipe.report.colours import FAINT, find_class_colour
+from tcpipe.report.colours import FAINT, choose_class_colours
 from tcpipe.report.page import (
     Number,
     Section,
@@ -34,6 +34,7 @@ from tcpipe.report.page import (
 from tcpipe.report.plots import Plot, make_plot, show_text
 from tcpipe.tables.columns import to_floats, to_texts
 from tcpipe.tables.findings import judge_again, read_threshold
+from tcpipe.terrain.layers import TerrainClass
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
 
@@ -293,7 +294,9 @@ def draw_predictions(table: pa.Table, audit: str) -> Section:
     if drawn.num_rows < table.num_rows:
         text += f" {drawn.num_rows} of {table.num_rows} are drawn, at random."
     class_id, names = drawn.column("terrain_class").to_numpy(), to_texts(drawn.column("terrain_name"))
-    legend = {str(name): find_class_colour(int(number)) for number, name in zip(class_id, names, strict=True)}
+    found = dict(zip(class_id.tolist(), map(str, names), strict=True))
+    classes = [TerrainClass(number, found[number], traversable=True) for number in sorted(found)]
+    legend = {found[number]: colour for number, colour in choose_class_colours(classes).items()}
     plots = list[Plot]()
     for quantity in ("E", "T"):
         label, said = (to_floats(drawn, make_column_name(quantity, part)) for part in ("", "predicted"))

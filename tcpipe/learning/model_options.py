@@ -44,7 +44,7 @@ class TrainOptions:
     patience: int | None = option(
         None, Option("Epochs without a better held-out loss before training stops.", kind=Range(1, 100_000), shown=12)
     )
-    batch_size: int | None = option(None, Option("Samples in a batch.", ("--batch-size",), Range(1, 65_536), shown=64))
+    batch_size: int | None = option(None, Option("Samples in a batch.", (), Range(1, 65_536), shown=64))
     learning_rate: float | None = option(None, Option(kind=Range(0.0, 1.0, is_open=True), shown=1e-4))
     fold: int | None = option(None, Option("Fold of train held out for early stopping.", kind=Range(0, 99), shown=0))
     mirror: bool | None = option(
@@ -77,7 +77,7 @@ class TrainOptions:
         ),
     )  # fmt: skip
     seed: int | None = option(None, Option("Seed of weights, shuffles and mirrors.", kind=SEED, shown=0))
-    no_resume: bool = option(False, Option("Start again instead of resuming a stopped training.", ("--no-resume",)))
+    no_resume: bool = option(False, Option("Start again instead of resuming a stopped training."))
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,17 +89,15 @@ class EvaluateOptions:
     """With drives: the dataset that the model was trained on."""
     out: str | Path = option("evaluation", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
-    noise_draws: int = option(
-        5, Option("Draws of noise for each ablated input set.", ("--noise-draws",), Range(1, 1000))
-    )
+    noise_draws: int = option(5, Option("Draws of noise for each ablated input set.", (), Range(1, 1000)))
     seed: int = option(0, Option("Seed of the noise.", kind=SEED))
     predictor: str | None = option(None, PREDICTOR)
-    drives: Sequence[str | Path] = option(
+    drive: Sequence[str | Path] = option(
         (),
         Option(
             "Evaluate MODEL on a whole drive instead: an ingested log, by its path or the name of its run; repeatable.",
             ("--drive",), metavar="LOG", repeatable=True,
         ),
     )  # fmt: skip
-    map_name: str | None = option(None, MAP)
+    map: str | None = option(None, MAP)
     store: str | Path = option("tcpipe-store", STORE)

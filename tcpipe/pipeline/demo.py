@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from tcpipe.errors import DatasetError, UsageError
@@ -51,7 +52,11 @@ class DemoResult:
         )
 
 
-def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoResult:
+_PARTS = 5
+"""Steps of the demo: simulate, ingest, add-map, build-dataset, report."""
+
+
+def run_demo(directory: Path, *, seed: int, begin_part: Callable[..., None]) -> DemoResult:
     """Simulate, ingest, add the map, build the dataset and write the reports under ``directory``.
 
     Raises `UsageError`: the directory holds something else; `DatasetError`: a step fails (which would be a bug).
@@ -62,23 +67,22 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
         raise UsageError(f"{directory}: is a file, expected a directory for the demo")
     if directory.exists() and any(directory.iterdir()) and not site_path.exists():
         raise UsageError(f"{directory}: exists and is no demo; give another directory")
-    say("simulating a site and two drives")
+    begin = partial(begin_part, total=_PARTS)
+    begin(0, text="simulating a site and two drives")
     site = simulate(site_path, scenario="demo", seed=seed)
-    for path in site.logs:
-        say(f"$ tcpipe ingest {path}")
+    begin(1, text=f"$ tcpipe ingest {' '.join(map(str, site.logs))}")
     ingested = ingest(site.logs, store=store_path, recipe=Recipe())
     if problems := [problem for result in ingested.results for problem in result.problems]:
         raise DatasetError(*problems)
     height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
-    say(
-        f"$ tcpipe add-map site --height {height} --ortho {ortho} --ortho-bands rgb --terrain {terrain} --classes {classes}"
-    )
+    rasters = f"--height {height} --ortho {ortho} --ortho-bands rgb --terrain {terrain} --classes {classes}"
+    begin(2, text=f"$ tcpipe add-map site {rasters}")
     added = add_map(
         "site", height=height, ortho=ortho, ortho_bands="rgb", terrain=terrain, classes=classes, store=store_path
     )
-    say(f"$ tcpipe build-dataset {dataset_path} --split {site.region}")
+    begin(3, text=f"$ tcpipe build-dataset {dataset_path} --split {site.region}")
     built = build_dataset(dataset_path, store=store_path, split=site.region, recipe=Recipe(), force=True)
-    say(f"$ tcpipe report {dataset_path}")
+    begin(4, text=f"$ tcpipe report {dataset_path}")
     of_store = report(store_path)  # first: the dataset's page leads to it
     pages = (*report(dataset_path), *of_store)
     statuses = {added.status, built.status, *(result.status for result in ingested.results)}

@@ -44,13 +44,13 @@ def make_tasks(
     sources: Iterable[LogSource], options: IngestOptions, root: Path | str, recipe: Recipe
 ) -> list[IngestTask]:
     """Return the task of each log; on a cluster, whose workers are elsewhere, with absolute paths."""
-    definitions = None if options.message_definitions is None else Path(options.message_definitions)
+    definitions = None if options.msgdef is None else Path(options.msgdef)
     if options.cluster is not None:
         root = root.absolute() if isinstance(root, Path) else root
         definitions = definitions and definitions.absolute()
-    robot, tags = options.robot or recipe.robot, dict(options.tags or {})
+    robot, tags = options.robot or recipe.robot, dict(options.tag or {})
     how = (root, recipe, robot, tags, options.force, definitions, make_definitions_key(definitions))
-    return [IngestTask(source, *how, options.retry_failed, options.min_age_s) for source in sources]
+    return [IngestTask(source, *how, options.retry_failed, options.min_age) for source in sources]
 
 
 Item: TypeAlias = tuple[int, IngestTask]
@@ -128,7 +128,7 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     opened = open_store(options.store, create=True)
     options = replace(options, logs=list(options.logs))
     given = tuple(make_absolute(path) for path in options.logs if not is_presigned(path))  # signed URLs are not stored
-    definitions = options.message_definitions and str(Path(options.message_definitions).absolute())
+    definitions = options.msgdef and str(Path(options.msgdef).absolute())
     key = None
     with suppress(TcpipeError):  # what is wrong with the recipe is an error of the call, which is recorded
         ruling = resolve_recipe(options.recipe)

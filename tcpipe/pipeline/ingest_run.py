@@ -216,6 +216,7 @@ def make_run(
         distance_by_reason_m=labelled.distance_by_reason_m,
         findings=info.report.findings,
         damage=read.damage,
+        energy_joule=None if label is None else label.energy_joule,
         energy_budget=None if label is None else label.energy_budget,
         idle_watt=None if label is None else label.physics.idle_watt,
         physics=list_physics_terms(label),

@@ -23,7 +23,7 @@ from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.runs import StoredMap
 from tcpipe.pipeline.calls import ADD_MAP, RunningCall, record_call
 from tcpipe.pipeline.options import AddMapOptions, Files
-from tcpipe.report.pictures import draw_quick_look, write_overview
+from tcpipe.report.pictures import draw_ortho, write_overview
 from tcpipe.store import Store, check_map_name, open_store
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.tables.options import as_function
@@ -69,7 +69,7 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
 
 
 def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
-    name, layers, categorical = check_map_name(options.name), options.layers or {}, options.categorical or {}
+    name, layers, categorical = check_map_name(options.name), options.layer or {}, options.categorical or {}
     _refuse_layers(layers, categorical, ortho=bool(options.ortho), ortho_bands=options.ortho_bands)
     given = {role: getattr(options, role) for role in ROLES}
     tables = {f"{name} {CLASSES}": table for name, table in categorical.items() if table}
@@ -99,7 +99,7 @@ def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
             crs=options.crs,
             inputs=inputs,
         )
-        write_overview(path.with_suffix(".png"), draw_quick_look(open_map(path)))
+        write_overview(path.with_suffix(".png"), draw_ortho(open_map(path)))
         before, state = state.maps.get(name), store.scan()
         if state.maps.get(name) != before:
             call.state = state

@@ -44,7 +44,7 @@ class IngestOptions:
             metavar="NAME",
         ),
     )
-    tags: Mapping[str, str] | None = tags("Tag for the runs; repeatable.")
+    tag: Mapping[str, str] | None = tags("Tag for the runs; repeatable.")
     jobs: int = jobs("Logs")
     cluster: str | None = option(
         None,
@@ -56,7 +56,7 @@ class IngestOptions:
     )
     """Workers see logs and store under the same absolute paths."""
     as_one: bool = option(False, Option("Treat all logs as parts of one drive (split logs; power in a separate log)."))
-    message_definitions: str | Path | None = option(None, MESSAGE_DEFINITIONS)
+    msgdef: str | Path | None = option(None, MESSAGE_DEFINITIONS)
     shard: tuple[int, int] | None = option(
         None,
         Option(
@@ -66,11 +66,11 @@ class IngestOptions:
             "I/N",
         ),
     )
-    min_age_s: float = option(
+    min_age: float = option(
         0.0,
         Option(
-            "Skip logs that were changed more recently than this (90, 90s, 10m, 2h, 1d).",
-            ("--min-age",),
+            "Skip logs that were changed more recently than this (90, 90s, 10m, 2h, 1d); a number is seconds.",
+            (),
             "duration",
             "T",
             shown="0",
@@ -111,11 +111,11 @@ class AddMapOptions:
         None, Option("Class table: CSV with value,id,name,traversable, or TOML.", (), "input_file", "FILE")
     )
     """None takes the store's, else the paper's seven classes. The first map with terrain or classes sets the store's table."""
-    layers: Mapping[str, Files] | None = option(
+    layer: Mapping[str, Files] | None = option(
         None,
         Option(
             "Another raster of one band, as layer NAME; repeatable.",
-            ("--layer",),
+            (),
             "layers",
             "NAME=FILE",
         ),
@@ -151,19 +151,19 @@ class BuildDatasetOptions:
         None, Option("GeoJSON region (WGS84): inside is train and test, outside is unseen.", (), "input_file", "FILE")
     )
     """None: everything is train and test."""
-    map_name: str | Sequence[str] | None = option(
+    map: str | Sequence[str] | None = option(
         None,
         Option(
             "Map to sample from (default: the only one in the store); repeatable; where maps overlap, the first has priority.",
-            ("--map",), "map", "NAME", repeatable=True
+            (), "map", "NAME", repeatable=True
         ),
     )  # fmt: skip
     robot: str | None = option(None, Option("Use only runs of this robot.", (), "robot", "NAME"))
-    tags: Mapping[str, str] | None = tags("Use only runs with this tag; if repeated, with all of the tags.")
+    tag: Mapping[str, str] | None = tags("Use only runs with this tag; if repeated, with all of the tags.")
     store: str | Path = option("tcpipe-store", STORE)
     recipe: Recipe | str | Path | None = option(None, RECIPE)
     jobs: int = jobs("Runs sampled")
-    file_format: FileFormat = option("zarr", Option(flags=("--format",), kind=("zarr", "parquet")))
+    format: FileFormat = option("zarr", Option("Format of the patches.", kind=("zarr", "parquet")))
     holdout: str | None = option(
         None,
         Option(

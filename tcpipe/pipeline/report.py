@@ -27,9 +27,8 @@ from tcpipe.power.witnesses import compare_batteries
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.report.label_sections import describe_physics
-from tcpipe.report.maps import StoredMaps
+from tcpipe.report.maps import StoredMaps, draw_tracks
 from tcpipe.report.page import is_made_from
-from tcpipe.report.pictures import find_picture_folder, iterate_pictures
 from tcpipe.report.run_report import run_report
 from tcpipe.report.store_report import FailedLog, RunKey, StoredDataset, StoreFacts, store_report
 from tcpipe.store import Store, find_named_runs, is_path, is_store
@@ -37,6 +36,9 @@ from tcpipe.tables.findings import (
     judge_by_code,
     read_catalogue_version,
 )
+
+_FEW_RUNS = 10
+"""The page of a store with fewer runs begins with their tracks and the table."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,6 @@ def report(
     store: Path | str = "tcpipe-store",
     recipe: Recipe | Path | str | None = None,
     runs: bool = True,
-    patches: bool = False,
 ) -> list[Page]:
     """Write ``report.html`` into a dataset or a store, here or at a URL, or beside the tables of a run of the store; return the pages.
 
@@ -64,14 +65,11 @@ def report(
     Raises `UsageError`: the path is something else; `StoreError`: something cannot be read; all other pages of a store are written.
 
     ``recipe`` is the current one: the page of a store sums over its runs. ``runs``: of a store, write the page of every run too.
-    ``patches``: of a dataset, write pictures of all patches beside the page.
     """
     is_there = is_path(path)
     is_one = is_there and is_store(path)
     if is_there and not is_one and (is_url(path) or (Path(path) / CARD).is_file()):
-        return [_report_dataset(path, patches=patches)]
-    if patches:
-        raise UsageError(f"{path}: is no dataset; --patches is for one")
+        return [_report_dataset(path)]
     if is_one:
         return _report_store(Store(path), resolve_recipe(recipe), runs=runs)
     if is_there:
@@ -104,7 +102,9 @@ def _write_store_page(store: Store, state: State, ruling: Recipe, *, will_be: It
         for row, size in zip(others, sizes, strict=True)
         if size is not None
     }
-    return _write(store.place, store_report(make_store_facts(store, state, ruling, pages | found)), ())
+    facts, runs = make_store_facts(store, state, ruling, pages | found), store.runs(state)
+    tracks = draw_tracks(runs, StoredMaps(store, state.maps)) if len(runs) < _FEW_RUNS else None
+    return _write(store.place, store_report(facts, tracks), ())
 
 
 def _name_page(row: RunFacts) -> str:
@@ -138,19 +138,12 @@ def _find_unchanged_page(run: StoredRun, made_from: str) -> Page | None:
     return None
 
 
-def _report_dataset(path: Path | str, *, patches: bool) -> Page:
-    """Write a dataset's page, and, before it, pictures of all patches, which it shows from then on."""
+def _report_dataset(path: Path | str) -> Page:
     directory, fetched = fetch_directory_by_range(path, by_range=lambda _: False)
+    html = render_dataset_report(directory, None if is_url(path) else directory.absolute().parent)
     place = open_place(path) if fetched is None else fetched.place
-    card = read_intact_card(directory)
-    if patches and not card.layers:
-        raise UsageError(f"{path}: has no patches to draw; remove --patches")
-    folder, count = find_picture_folder(card)
-    for name, data in iterate_pictures(directory, card) if patches else ():
-        place.put(f"{folder}/{name}", data)
-    shown = folder if card.samples and len(place.list(folder)) == count else ""
-    html = render_dataset_report(directory, None if is_url(path) else directory.absolute().parent, folder=shown)
-    return _write(place, html, tuple(describe_physics(robot, fit) for robot, fit in card.physics.items()))
+    physics = read_intact_card(directory).physics
+    return _write(place, html, tuple(describe_physics(robot, fit) for robot, fit in physics.items()))
 
 
 def _describe_physics(run: StoredRun) -> tuple[str, ...]:

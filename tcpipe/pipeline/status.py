@@ -180,7 +180,7 @@ def _find_tasks(
     for works_on, how in [] if logs else calls.items():
         mine = [log for log in works_on if asked[log][0] == works_on]
         robot = options.robot or how.robot
-        again = replace(options, robot=robot, as_one=how.as_one, message_definitions=how.message_definitions)
+        again = replace(options, robot=robot, as_one=how.as_one, msgdef=how.message_definitions)
         groups.append((mine, again))
     tasks, missing = list[IngestTask](), dict[str, tuple[str, ...]]()
     for mine, again in groups:

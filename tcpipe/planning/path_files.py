@@ -212,12 +212,12 @@ def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
     for label, end in (("--from", start), ("--to", goal)):
         check_lonlat(label, end[None])
     check_model(model, source)
-    frame = make_frame(source, options.origin_deg)
+    frame = make_frame(source, options.origin)
     costs = None if options.cost_map is None else _read_costs(fetch_directory(options.cost_map), model, source)
-    risk = RISK if options.risk is None and options.budget_joule is not None else options.risk
+    risk = RISK if options.risk is None and options.budget is not None else options.risk
     found = plan_path(
-        make_survey(model, source, options.cell_size_m if costs is None else costs), start, goal, options.objective,
-        allow_extrapolation=options.allow_extrapolation, risk=risk, budget_joule=options.budget_joule,
+        make_survey(model, source, options.cell_size if costs is None else costs), start, goal, options.objective,
+        allow_extrapolation=options.allow_extrapolation, risk=risk, budget_joule=options.budget,
         step=options.on_step or (lambda _, __: None),
     )  # fmt: skip
     local = Frame(source, (float(start[0]), float(start[1])))

@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 _ORIGIN = Option(
     "Origin of the map frame of Nav2, whose axes are true east and north (default: the plane of the map's CRS).",
-    ("--origin",), "lonlat",
+    (), "lonlat",
 )  # fmt: skip
 
 
 _CELL_SIZE = Option(
-    "Side of a cell; plans on a cost map have its cells.", ("--cell-size",), Range(0.05, 1000.0), "METRES"
+    "Side of a cell; plans on a cost map have its cells.", (), Range(0.05, 1000.0), "METRES"
 )  # fmt: skip
 
 
@@ -31,11 +31,11 @@ class PredictPathOptions:
     model: str | Path = required(MODEL)
     path: str | Path = required(Option("GeoJSON LineString (WGS84, lon before lat).", (), "input_file", "FILE"))
     _: KW_ONLY
-    map_name: str | None = option(None, MAP)
+    map: str | None = option(None, MAP)
     out: str | Path | None = option(
         None, Option("Write the table of path segments: .csv or .geojson.", (), "output_file", "FILE")
     )
-    speed_mps: float | None = option(None, SPEED)
+    speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
     adapt: str | Path | None = option(
         None,
@@ -52,11 +52,13 @@ class PlanPathOptions:
     """End points, model and objective of a plan."""
 
     model: str | Path = required(MODEL)
-    start: tuple[float, float] = required(Option("Start of the path (WGS84, degrees).", ("--from",), "lonlat"))
-    goal: tuple[float, float] = required(Option("End of the path.", ("--to",), "lonlat"))
+    start: tuple[float, float] = required(
+        Option("Start of the path (WGS84, degrees).", ("--from", "--start"), "lonlat")
+    )
+    goal: tuple[float, float] = required(Option("End of the path.", ("--to", "--goal"), "lonlat"))
     _: KW_ONLY
     objective: Objective = option("energy", Option("Quantity to minimise.", (), ("energy", "time", "distance")))
-    map_name: str | None = option(None, MAP)
+    map: str | None = option(None, MAP)
     out: str | Path = option("plan.geojson", Option("Write the path as GeoJSON.", (), "output_file", "FILE"))
     cost_map: str | Path | None = option(
         None,
@@ -67,12 +69,11 @@ class PlanPathOptions:
             "DIR",
         ),
     )
-    cell_size_m: float = option(1.0, _CELL_SIZE)
+    cell_size: float = option(1.0, _CELL_SIZE)
     allow_extrapolation: bool = option(
         False,
         Option(
-            "Also cross ground outside the training range of the model.",
-            ("--allow-extrapolation",)
+            "Also cross ground outside the training range of the model."
         ),
     )  # fmt: skip
     risk: float | None = option(
@@ -82,12 +83,15 @@ class PlanPathOptions:
             (), Range(0.5, 0.999), "PROBABILITY",
         ),
     )  # fmt: skip
-    budget_joule: float | None = option(
+    budget: float | None = option(
         None,
-        Option("Print the probability that this energy suffices: 300Wh, 500kJ.", ("--budget",), "energy", "ENERGY"),
+        Option("Print the probability that this energy suffices: 300Wh, 500kJ.", (), "energy", "ENERGY"),
     )
-    origin_deg: tuple[float, float] | None = option(None, _ORIGIN)
-    speed_mps: float | None = option(None, SPEED)
+    round_trip: bool = option(
+        False, Option("Plan the way back, too; a budget is for both.", ("--return", "--round-trip"))
+    )
+    origin: tuple[float, float] | None = option(None, _ORIGIN)
+    speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
     store: str | Path = option("tcpipe-store", STORE)
     on_step: Callable[[int, int], None] | None = None
@@ -101,10 +105,10 @@ class CostMapOptions:
     model: str = required(MODEL)
     out: str = option("cost-map", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
-    map_name: str | None = option(None, MAP)
-    cell_size_m: float = option(1.0, _CELL_SIZE)
-    origin_deg: tuple[float, float] | None = option(None, _ORIGIN)
-    speed_mps: float | None = option(None, SPEED)
+    map: str | None = option(None, MAP)
+    cell_size: float = option(1.0, _CELL_SIZE)
+    origin: tuple[float, float] | None = option(None, _ORIGIN)
+    speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
     store: str = option("tcpipe-store", STORE)
 
@@ -117,9 +121,9 @@ class RouteGraphOptions:
     graph: str = required(Option("Graph (GeoJSON, metres).", (), "input_file", "FILE"))
     _: KW_ONLY
     out: str = option("route-graph.geojson", Option("Write the graph.", (), "output_file", "FILE"))
-    origin_deg: tuple[float, float] | None = option(None, _ORIGIN)
+    origin: tuple[float, float] | None = option(None, _ORIGIN)
     two_way: bool = option(False, Option("Add an edge back for each that has none."))
-    map_name: str | None = option(None, MAP)
-    speed_mps: float | None = option(None, SPEED)
+    map: str | None = option(None, MAP)
+    speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
     store: str = option("tcpipe-store", STORE)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from tcpipe.tables.bits import DropReason
+from tcpipe.terrain.layers import TerrainClass
 
 FAINT = "#8a97a3"
 KEPT = "#009e73"
 DROPPED = "#d55e00"
 SPLIT_COLOURS = {"train": "#0072b2", "test": "#e69f00", "unseen": "#c2185b", "buffer": FAINT}
 CLASS_COLOURS = ("#aa3377", "#228833", "#66ccee", "#ccbb44", "#ee6677", "#4477aa", "#bbbbbb")
-"""Paul Tol's bright scheme; class 1 has the first one, beyond the last they begin again."""
+"""Paul Tol's bright scheme, of robots, runs, and classes that no word of their name colours; beyond the last they begin again."""
 CURSOR = "#ff2d95"
 DOUBTED = "#e69f00"
 UNUSED = "#8fd3bd"
@@ -31,6 +34,32 @@ LINE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00"
 """Lines in one plot; the first is the fused value."""
 
 
-def find_class_colour(number: int) -> str:
-    """Return the colour of a terrain class; 0 is unknown."""
-    return CLASS_COLOURS[(number - 1) % len(CLASS_COLOURS)] if number > 0 else FAINT
+_GROUND_COLOURS = {
+    "#b89a63": ("unpaved",),
+    "#4a4f55": ("paved", "asphalt"),
+    "#c9c8c0": ("concrete",),
+    "#9b9b9b": ("gravel",),
+    "#77706a": ("rock", "stone"),
+    "#e0c37c": ("sand",),
+    "#dfeaf2": ("snow", "ice"),
+    "#6b4423": ("mud",),
+    "#8f653c": ("soil", "dirt"),
+    "#2f7fd6": ("water",),
+    "#17592d": ("tree", "forest"),
+    "#2f8f5b": ("vegetation", "bush"),
+    "#6cb52d": ("grass", "meadow"),
+    "#c0392b": ("obstacle", "building"),
+}
+"""Words of a class's name by colour; of several colours the first one here counts."""
+
+
+def choose_class_colours(classes: Iterable[TerrainClass]) -> dict[int, str]:
+    """Return a colour for each class id: of the class table, else by its name, else, or where it is taken, by the id."""
+    chosen = dict[int, str]()
+    for entry in classes:
+        name = entry.name.lower()
+        named = (colour for colour, words in _GROUND_COLOURS.items() if any(word in name for word in words))
+        colour = entry.color or next(named, "")
+        is_free = colour and colour not in chosen.values()
+        chosen[entry.id] = colour if is_free else CLASS_COLOURS[(entry.id - 1) % len(CLASS_COLOURS)]
+    return chosen

@@ -177,14 +177,7 @@ page.start(async () => {
   const idOf = (i) => facts.samples.ids ? facts.samples.ids[i] : `${facts.runs[c.run[i]].id}-${start(i)}`;
   const flagsOf = (i) => facts.quality.filter(([bit]) => c.quality[i] & bit).map(([, words]) => words).join("; ") || "clean";
   const withStd = (i, name) => page.quantity(c[name][i], kinds[name][1], kinds[name][2] + 1, c[`${name}_std`]?.[i]);
-  // Sheets with a sample's patch, and its number in them: inside the page, or beside it.
-  function pictureOf(i) {
-    if (cell.has(i)) return [sheets, cell.get(i)];
-    if (!sheets || !facts.folder) return null;
-    const layers = sheets.layers.map(({ name }, k) => ({ name, uri: `${facts.folder}/${k}-${Math.floor(i / facts.per_sheet)}.webp` }));
-    return [{ ...sheets, layers }, i % facts.per_sheet];
-  }
-  const noPicture = sheets ? `The page carries ${sheets.rows.length} of ${facts.count} patches; 'tcpipe report --patches' puts all beside it.` : "";
+  const noPicture = sheets ? `The page carries ${sheets.rows.length} of ${facts.count} patches; tcpipe.open_dataset reads all.` : "";
   const labelsOf = (i) => [
     ...there(["power", "velocity", "duration", "energy", "slip", "vibration"]).map((name) => [kinds[name][0], withStd(i, name)]),
     ...there(["slope"]).map((name) => [name, digits(c.slope[i], name)]), ["turn", digits(c.turn[i], "turn")],
@@ -218,14 +211,7 @@ page.start(async () => {
     }
     left.append(pairs(labelsOf(current)));
     right.append(pairs(originOf(current)));
-    const picture = pictureOf(current);
-    if (picture) {
-      middle.append(...page.patches(...picture));
-      const lost = () => middle.replaceChildren(make("p", `${facts.folder} is not beside this page.`, { className: "note" }));
-      if (picture[0] !== sheets) Object.assign(new Image(), { src: picture[0].layers[0].uri, onerror: lost });
-    } else {
-      middle.append(make("p", noPicture, { className: "note" }));
-    }
+    middle.append(...(cell.has(current) ? page.patches(sheets, cell.get(current)) : [make("p", noPicture, { className: "note" })]));
     box.append(left, middle, right);
   }
 
@@ -251,9 +237,8 @@ page.start(async () => {
     const shown = rows.slice(first, first + perPage);
     at("gallery").replaceChildren(...(sheets ? shown : []).map((i) => {
       const button = make("button", "", { type: "button", ariaPressed: `${i === current}` });
-      const picture = pictureOf(i);
-      const layer = picture?.[0].layers.find((one) => one.name === at("layer").value);
-      button.append(picture ? page.patch(picture[0], layer, picture[1], 92) : make("span", "not in this page", { className: "patch" }));
+      const layer = sheets.layers.find((one) => one.name === at("layer").value);
+      button.append(cell.has(i) ? page.patch(sheets, layer, cell.get(i), 92) : make("span", "not in this page", { className: "patch" }));
       button.append([className(i), ...there(["slope", "power"]).map((name) => digits(c[name][i], name)), splitName(i)].join(", "));
       button.onclick = () => {
         if (selected.length > 1) focus(i);
@@ -262,7 +247,7 @@ page.start(async () => {
       };
       return button;
     }));
-    at("no-picture").hidden = !sheets || shown.every((i) => pictureOf(i));
+    at("no-picture").hidden = !sheets || shown.every((i) => cell.has(i));
     at("no-picture").textContent = noPicture;
     at("page-count").textContent = rows.length ? `${first + 1} to ${first + shown.length} of ${rows.length}` : "none";
     at("page-before").disabled = first === 0;

@@ -18,10 +18,9 @@ from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_card import LOCAL, DatasetCard, group_dataset_findings, judge_dataset
 from tcpipe.formats.dataset_files import read_intact_card, read_samples, sample_columns
 from tcpipe.formats.documents import BLOBS
-from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.place import REPORT
-from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, find_class_colour
+from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, choose_class_colours
 from tcpipe.report.label_sections import (
     LABELS,
     QUALITY_WORDS,
@@ -42,7 +41,7 @@ from tcpipe.report.page import (
     render_page,
     show_verdict,
 )
-from tcpipe.report.pictures import PER_SHEET, make_patches_data
+from tcpipe.report.pictures import make_patches_data
 from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.stages.sample import separate_frames
@@ -71,13 +70,11 @@ class SamplesShown:
     json: Json
 
 
-def render_dataset_report(
-    directory: Path, beside: Path | None = None, *, folder: str = "", samples: pa.Table | None = None
-) -> str:
+def render_dataset_report(directory: Path, beside: Path | None = None, *, samples: pa.Table | None = None) -> str:
     """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model.
 
-    ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too. ``folder`` beside the page
-    holds pictures of all patches (`tcpipe.report.pictures.iterate_pictures`), if it is given. ``samples`` has at least
+    ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too.
+    ``samples`` has at least
     `SAMPLE_COLUMNS` of the samples; None: they are read.
     Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
     """
@@ -94,13 +91,18 @@ def render_dataset_report(
         patches, lost = None, [*lost, f"no patches are shown: {error.problems[0]}"]
     waterfall = draw_waterfall(card.distance_by_reason_m)
     hrefs = {} if beside is None else _find_run_pages(beside, card)
+    stores = sorted(
+        name
+        for name in {href.split("/")[1] for href in hrefs.values()}
+        if ((beside or directory) / name / REPORT).is_file()
+    )
     groups = group_dataset_findings(card.findings, card.findings_by_run, card.findings_by_map)
     return render_page(
         title=f"Dataset {card.name}",
         lead=card.description or f"{card.format} format, data model {card.data_model_version}",
         verdict=show_verdict(judge_dataset(card.findings, card.runs, card.maps), groups=groups),
         numbers=_make_numbers(card),
-        links=[] if beside is None else _list_store_pages(beside, hrefs),
+        links=[Link(f"All runs of {name}", f"../{name}/{REPORT}") for name in stores],
         warnings=lost,
         sections=[
             _make_map_section(shown, card.samples, plots),
@@ -124,8 +126,7 @@ def render_dataset_report(
             _make_provenance_section(card),
         ],
         script="dataset.js" if samples.num_rows else "",
-        data=_make_data(card, samples, shown, patches=patches, map_plot=plots[0], hrefs=hrefs) | {"folder": folder},
-        reads_pictures=bool(folder),
+        data=_make_data(card, samples, shown, patches=patches, map_plot=plots[0], hrefs=hrefs),
     )
 
 
@@ -164,16 +165,14 @@ def _make_data(
     map_plot: Plot,
     hrefs: Mapping[str, str],
 ) -> dict[str, Json]:
+    colours = choose_class_colours(card.classes)
     names = [renderer.name or "" for renderer in map_plot.figure.renderers]
     return {
         "count": card.samples,
-        "per_sheet": PER_SHEET,
         "samples": shown.json,
         "patches": patches,
         "ground": [name.removeprefix("layer ") for name in names if name.startswith("layer ")],
-        "classes": [
-            {"id": entry.id, "name": entry.name, "colour": find_class_colour(entry.id)} for entry in card.classes
-        ],
+        "classes": [{"id": entry.id, "name": entry.name, "colour": colours[entry.id]} for entry in card.classes],
         "splits": [{"name": name, "colour": SPLIT_COLOURS[name], "count": card.splits[name]} for name in SPLIT_COLOURS],
         "runs": [
             {"id": run.run_id, "first_ns": str(first), "href": hrefs.get(run.run_id)}
@@ -199,12 +198,6 @@ def _find_run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
     return found
 
 
-def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
-    """Return the existing pages of the stores of these runs' pages (`_find_run_pages`)."""
-    stores = sorted({href.split("/")[1] for href in hrefs.values()})
-    return [Link(f"All runs of {name}", f"../{name}/{REPORT}") for name in stores if (beside / name / REPORT).is_file()]
-
-
 def _make_audit_section(card: DatasetCard) -> Section:
     rows = [
         (
@@ -224,17 +217,6 @@ def _make_audit_section(card: DatasetCard) -> Section:
     header = ("split", *counts, "nearest train", "median")
     text = "Held-out samples near training samples. On the map: colour by distance to the nearest training sample, or tick its lines."
     return Section("Leakage audit", text, header=header, rows=rows)
-
-
-def _make_finding_sections(card: DatasetCard) -> list[Section]:
-    """Return the findings of ingest by code, if any."""
-    samples = {run.run_id: run.samples for run in card.runs}
-    rows = [
-        (format_group(group, len(card.runs)), ", ".join(group.of), sum(samples[run_id] for run_id in group.of))
-        for group in group_findings(card.findings_by_run.items())
-    ]
-    text = "One line per code; the page of each run lists all of its findings."
-    return [Section("Findings of ingest", text, header=("finding", "runs", "samples"), rows=rows)] if rows else []
 
 
 def _make_class_sections(card: DatasetCard) -> list[Section]:
@@ -258,7 +240,7 @@ def _make_run_section(card: DatasetCard, hrefs: Mapping[str, str]) -> Section:
     if hrefs:
         text = "Links lead to the pages of the runs, once 'tcpipe report STORE' has written them."
     header = ("run", "robot", "log", "samples", "noise floor of E")
-    return Section("Runs", text, header=header, rows=runs, parts=_make_finding_sections(card))
+    return Section("Runs", text, header=header, rows=runs)
 
 
 def _make_provenance_section(card: DatasetCard) -> Section:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,13 +12,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from tcpipe.errors import TcpipeError, clean_line
+from tcpipe.errors import StoreError, TcpipeError, clean_line
 from tcpipe.formats.dataset_card import LOCAL, DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, OVERVIEW, RELIEF
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.runs import StoredMap
 from tcpipe.formats.stored_runs import StoredRun
-from tcpipe.report.colours import CURSOR, FAINT, SPLIT_COLOURS
+from tcpipe.report.colours import CLASS_COLOURS, CURSOR, FAINT, SPLIT_COLOURS, choose_class_colours
 from tcpipe.report.pictures import (
     Bounds,
     compute_joint_bounds_m,
@@ -30,11 +31,14 @@ from tcpipe.report.pictures import (
 from tcpipe.report.plots import Plot, lay_picture, make_map_plot, make_plot
 from tcpipe.store import Store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
+from tcpipe.terrain.layers import TerrainClass
 
 Floats = NDArray[np.float64]
 Pictures = Mapping[str, str]
 """Pictures of a map by name, as data URIs; the first is visible."""
 
+_MOST_POINTS = 2_000
+"""Points of a track on the map of a store."""
 _LEAST_SHARE = 0.5
 """Smallest share of the track on a map that becomes its background."""
 
@@ -52,6 +56,7 @@ def draw_dataset_map(directory: Path, card: DatasetCard, xy_m: Floats) -> tuple[
         alt=f"Map of {len(xy_m)} points, coloured by the quantity chosen above; the tables below list the counts.",
         axes=("x [m]", "y [m]") if card.plane_crs == LOCAL else ("easting [m]", "northing [m]"),
         height_px=110 + 330 * (bounds[3] - bounds[1]) / max(bounds[2] - bounds[0], 1e-9),
+        legend=make_legend(card.classes if CLASSES in card.checksums else ()),
         tools=f"pan,wheel_zoom,{tools},reset,save",
     )
     lost = _lay_dataset_pictures(plot, directory, card, bounds)
@@ -106,6 +111,12 @@ def draw_dataset_map(directory: Path, card: DatasetCard, xy_m: Floats) -> tuple[
     marks = figure.scatter("x", "y", source=here, name="here", **ring)
     brush.figure.scatter("across", "up", source=marks.data_source, **ring)
     return [plot, brush, _draw_histogram()], lost
+
+
+def make_legend(classes: Sequence[TerrainClass]) -> dict[str, str]:
+    """Return the colours of terrain classes by name."""
+    colours = choose_class_colours(classes)
+    return {entry.name: colours[entry.id] for entry in classes}
 
 
 def _draw_histogram() -> Plot:
@@ -191,28 +202,57 @@ def draw_run_map(run: StoredRun, track: pa.Table, segments: pa.Table, maps: Stor
             np.column_stack([to_floats(segments, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")
         )
         xy_m = np.column_stack([to_floats(track, "x_m"), to_floats(track, "y_m")])
-        plot = _draw_track(("east [m]", "north [m]"), xy_m)
-        missing = missing or [_explain_no_map(maps, has_datum=has_datum)]
+        plot = _draw_track(("east [m]", "north [m]"), xy_m, {})
+        if not has_datum:
+            missing = ["No GNSS fix: the track has only local coordinates and cannot be placed on a map."]
+        elif not missing:
+            missing = [
+                "No map of the store covers the track." if maps.records else "The store has no map ('tcpipe add-map')."
+            ]
         return RunMap(plot, xy_m, (start, end), (), tuple(missing), is_complete)
-    to_map, bounds_m, pictures = ground
+    to_map, source, pictures = ground
     xy_m = to_map(lonlat)
-    plot = _draw_track(("easting [m]", "northing [m]"), xy_m)
+    classes = source.layers["terrain"].classes if "terrain" in source.layers else None
+    plot = _draw_track(("easting [m]", "northing [m]"), xy_m, make_legend(classes.classes if classes else ()))
     for number, (name, uri) in enumerate(pictures.items()):
-        lay_picture(plot, name, uri, bounds_m, visible=number == 0)
+        lay_picture(plot, name, uri, source.grid.bounds_m, visible=number == 0)
     ends_xy_m = to_map(read_lonlat_deg(segments, "start")), to_map(read_lonlat_deg(segments, "end"))
     return RunMap(plot, xy_m, ends_xy_m, tuple(pictures), tuple(missing), is_complete)
 
 
-def _explain_no_map(maps: StoredMaps, *, has_datum: bool) -> str:
-    if not has_datum:
-        return "No GNSS fix: the track has only local coordinates and cannot be placed on a map."
-    return "No map of the store covers the track." if maps.records else "The store has no map ('tcpipe add-map')."
+def draw_tracks(runs: Sequence[StoredRun], maps: StoredMaps) -> Plot | None:
+    """Return the tracks of runs on the first map that contains most of them, else in one plane; None of runs without places."""
+    places_deg = dict[str, Floats]()
+    for run in runs:
+        with suppress(StoreError):
+            track = run.table("track", ["lon_deg", "lat_deg"])
+            lonlat = np.column_stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")])
+            if len(known := lonlat[np.isfinite(lonlat).all(axis=1)]):
+                places_deg[run.run_id] = known[:: max(1, len(known) // _MOST_POINTS)]
+    if not places_deg:
+        return None
+    all_deg = np.concatenate([*places_deg.values()])
+    ground, _ = _find_ground(runs[0], all_deg, maps)
+    origin_m = 111_320.0 * np.array([np.cos(np.radians(all_deg[0, 1])), 1.0])  # of a degree
+    to_map = ground[0] if ground else lambda lonlat: (lonlat - all_deg[0]) * origin_m
+    colours = {run_id: CLASS_COLOURS[n % len(CLASS_COLOURS)] for n, run_id in enumerate(places_deg)}
+    axes = ("easting [m]", "northing [m]") if ground else ("east [m]", "north [m]")
+    plot = make_map_plot(alt="Map of the tracks of all runs.", axes=axes, height_px=420, legend=colours)
+    lines = [
+        plot.figure.line(*to_map(lonlat).T, color=colours[run_id], line_width=3, name=run_id)
+        for run_id, lonlat in places_deg.items()
+    ]
+    plot.figure.x_range.renderers = plot.figure.y_range.renderers = lines
+    if ground:
+        name, uri = next(iter(ground[2].items()))
+        lay_picture(plot, name, uri, ground[1].grid.bounds_m, visible=True)
+    return plot
 
 
 def _find_ground(
     run: StoredRun, lonlat: Floats, maps: StoredMaps
-) -> tuple[tuple[Callable[[Floats], Floats], Bounds, Pictures] | None, list[str]]:
-    """Return projection, bounds and pictures of the first map that contains most of the track, and the maps that cannot be read."""
+) -> tuple[tuple[Callable[[Floats], Floats], MapFile, Pictures] | None, list[str]]:
+    """Return projection, map and pictures of the first map that contains most of the track, and the maps that cannot be read."""
     lost: list[str] = []
     for name, record in maps.records.items():
         try:
@@ -225,19 +265,20 @@ def _find_ground(
             if source.grid.contains(to_map(lonlat)).mean() > _LEAST_SHARE:
                 if name not in maps.pictures:
                     maps.pictures[name] = _draw_pictures(source)
-                return (to_map, source.grid.bounds_m, maps.pictures[name]), lost
+                return (to_map, source, maps.pictures[name]), lost
         except (TcpipeError, OSError) as error:
             lost.append(f"Map {name} cannot be shown: {clean_line(str(error))}.")
     return None, lost
 
 
-def _draw_track(axes: tuple[str, str], xy_m: Floats) -> Plot:
+def _draw_track(axes: tuple[str, str], xy_m: Floats, legend: Mapping[str, str]) -> Plot:
     low, high = xy_m.min(axis=0), xy_m.max(axis=0)
     width, height = np.maximum(high - low, 0.1 * np.max(high - low, initial=10.0))
     plot = make_map_plot(
         alt="Map of the track: segments, and where and why the rest is not used; the chart below shows the distances.",
         axes=axes,
         height_px=110 + 900 * height / width,
+        legend=legend,
     )
     figure = plot.figure
     corners = {"xs": [[low[0], high[0]]], "ys": [[low[1], high[1]]], "colour": ["#00000000"]}

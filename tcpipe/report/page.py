@@ -193,7 +193,6 @@ def render_page(
     links: Sequence[Link] = (),
     script: str = "",
     data: Json = None,
-    reads_pictures: bool = False,
     made_from: str = "",
 ) -> str:
     """Return the page's HTML; every text is escaped, everything is inline.
@@ -204,7 +203,6 @@ def render_page(
     sections : in the order of the page; the first is next to the verdict, the titles form the table of contents.
     links : pages that belong to it.
     script, data : file beside this one that runs when all figures are drawn, and its data.
-    reads_pictures : whether the page may load pictures beside it; it never loads anything else.
     made_from : digest of the inputs, by which `is_made_from` finds that the page need not be rendered again; "" if it has to be.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
@@ -218,7 +216,6 @@ def render_page(
         warnings=warnings,
         verdict=verdict,
         links=links,
-        pictures="'self' file: " if reads_pictures else "",
         made_from=_MADE_FROM.format(made_from) if made_from else "",
         sections=sections,
         ids={plot.figure.name: id_ for plot, id_ in zip(drawn, ids, strict=True)},
@@ -229,7 +226,7 @@ def render_page(
     )
     visible = _INVISIBLE.sub(lambda match: clean_line(match[0]), page)
     blocks = [_format_json("page-data", _clean_data(data)), _format_json("page-figures", figures)]
-    code = [plots.read_bokeh_script()] if ids else []
+    code = [plots.BOKEH_SCRIPT.read_text(encoding="utf-8")] if ids else []
     code += [_read_file("page.js"), *([_read_file(script)] if script else [])]
     return visible.replace(_SCRIPTS, "\n".join(blocks + [f"<script>\n{part}\n</script>" for part in code]), 1)
 

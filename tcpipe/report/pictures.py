@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,12 @@ from pyproj import Transformer
 
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import PatchFiles, find_places_in_files, open_patches, read_samples
+from tcpipe.formats.dataset_files import PatchFiles, find_places_in_files, open_patches
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.published_outputs import REPORT_PATCHES
-from tcpipe.report.colours import CLASS_COLOURS
+from tcpipe.report.colours import choose_class_colours
 from tcpipe.tables.columns import to_floats
-from tcpipe.terrain.layers import COLOURS, Pixels
+from tcpipe.terrain.layers import COLOURS, MAX_ID, ClassTable, Pixels
 
 Bytes = NDArray[np.uint8]
 
@@ -65,11 +64,12 @@ def make_sheet(patches: NDArray[np.uint8]) -> Bytes:
     return np.ascontiguousarray(whole.reshape(rows * px, ACROSS * px, *patches.shape[3:]))
 
 
-def colour_classes(ids: NDArray[np.integer]) -> Bytes:
+def colour_classes(ids: NDArray[np.generic], classes: ClassTable | None) -> Bytes:
     """Return class ids of any shape as colours, one axis more; 0, no data, is white."""
-    table = np.array([*map(ImageColor.getrgb, ("#ffffff", *CLASS_COLOURS))], np.uint8)
-    index = np.where(ids > 0, (ids.astype(np.int64) - 1) % len(CLASS_COLOURS) + 1, 0)
-    picture: Bytes = table[index]
+    table = np.full((MAX_ID + 1, 3), 255, np.uint8)
+    for number, colour in choose_class_colours(classes.classes if classes else ()).items():
+        table[number] = ImageColor.getrgb(colour)
+    picture: Bytes = table[ids.astype(np.int64)]
     return picture
 
 
@@ -85,7 +85,6 @@ def colour_heights(values: NDArray[np.float64]) -> Bytes:
 
 
 _SIDE_PX = 900
-_TINT = 0.35
 
 
 def map_overview(source: MapFile) -> NDArray[np.uint8]:
@@ -130,7 +129,7 @@ def draw_classes(source: MapFile) -> NDArray[np.uint8]:
     level, step = _level(source)
     if "terrain" not in level.layers:
         return np.full((*draw_relief(source).shape, 3), 255, np.uint8)
-    return colour_classes(_thin_layer(level, "terrain", step).astype(np.int64))
+    return colour_classes(_thin_layer(level, "terrain", step), level.layers["terrain"].classes)
 
 
 def draw_maps(
@@ -158,19 +157,6 @@ def draw_maps(
         pixels = picture[row[inside], col[inside]]
         whole[inside] = pixels if picture.ndim == 3 else pixels[:, None]
     return whole
-
-
-def draw_quick_look(source: MapFile) -> NDArray[np.uint8]:
-    """Return the overview in colour, shape (R, C, 3): terrain classes tinted over it, white where a layer has no data."""
-    level, step = _level(source)
-    picture = map_overview(source)[..., None].repeat(3, axis=2)
-    missing = np.zeros(picture.shape[:2], np.bool_)
-    for layer in level.layers:
-        pixels = _thin_layer(level, layer, step)
-        missing |= ~level.layers[layer].has_data(pixels)
-        if layer == "terrain":
-            picture = ((1.0 - _TINT) * picture + _TINT * colour_classes(pixels.astype(np.int64))).astype(np.uint8)
-    return np.where(missing[..., None], np.uint8(255), picture)
 
 
 def _level(source: MapFile) -> tuple[MapFile, int]:
@@ -218,9 +204,6 @@ _PX = 48
 
 _MOST_PIECES = 24
 """Pieces of the files that are read: the order of patches is random, so a few pieces contain all kinds."""
-
-PER_SHEET = 10 * ACROSS
-"""Patches in a picture of that folder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,29 +281,6 @@ def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[An
     return {name: colour if name == "ortho" else stack for name, stack in pixels.items() if name not in COLOURS}
 
 
-def find_picture_folder(card: DatasetCard) -> tuple[str, int]:
-    """Return the folder of the pictures of all patches, relative to the page, and their number."""
-    shown = len(card.layers)
-    layers = shown - (len(COLOURS) if set(COLOURS) <= set(card.layers) else 0)
-    return f"{REPORT_PATCHES}/{card.inputs[:16]}", layers * -(-card.samples // PER_SHEET)
-
-
-def iterate_pictures(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes]]:
-    """Yield file name and content of the pictures of all patches, in the order of the samples.
-
-    Raises `DatasetError`: they cannot be read.
-    """
-    samples = read_samples(directory, ("split", "terrain_name", "slope_rad"))
-    patches = _open_patches(directory, card, samples)
-    selected = patches.read(patches.select(samples)) if samples.num_rows else {}
-    ranges = {name: _find_range(stack) for name, stack in selected.items()}
-    for number, first in enumerate(range(0, samples.num_rows, PER_SHEET)):
-        stacks = patches.read(np.arange(first, min(first + PER_SHEET, samples.num_rows)))
-        for layer, (name, stack) in enumerate(stacks.items()):
-            pixels, exact = _make_sheet(name, stack, patches.files, ranges[name])
-            yield f"{layer}-{number}.webp", encode_picture(pixels, exact=exact)
-
-
 def _find_range(stack: NDArray[np.generic]) -> tuple[float, float]:
     """Return the range that contains most pixels."""
     low, high = np.percentile(stack.astype(np.float64), (1, 99))
@@ -333,7 +293,7 @@ def _make_sheet(
     """Return patches of a layer as one sheet, and whether every pixel counts; a photograph is shown over a range of its values."""
     layer = files.layers[name]
     if layer.kind == "categorical":
-        return make_sheet(colour_classes(stack.astype(np.int64))), True
+        return make_sheet(colour_classes(stack, layer.classes)), True
     values = stack.astype(np.float64)
     if name.startswith("ortho"):
         low, high = shown

@@ -18,17 +18,17 @@ from typing import Any, cast
 
 import bokeh
 import numpy as np
-import pyarrow as pa
 from bokeh.document import Document
-from bokeh.models import HoverTool, NoOverlap
+from bokeh.models import HoverTool
 from bokeh.models.annotations.geometry import Span
 from bokeh.plotting import figure
 
 from tcpipe.errors import clean_line
 from tcpipe.formats.json_files import Json
-from tcpipe.report.colours import CURSOR, DROPPED, FAINT, KEPT, SPLIT_COLOURS
-from tcpipe.tables.columns import to_floats
+from tcpipe.report.colours import CURSOR, DROPPED, KEPT, SPLIT_COLOURS
 
+BOKEH_SCRIPT = Path(bokeh.__file__).parent / "server/static/js/bokeh.min.js"
+"""The part of BokehJS that a page needs."""
 _TEX = re.compile(r"\$\$|\\\(|\\\[")
 _UNREAD = "\u2060"
 """Between the signs of a formula it keeps a name from being read as one; it takes no room."""
@@ -92,11 +92,18 @@ def make_plot(
 
 
 def make_map_plot(
-    *, alt: str, axes: tuple[str, str], height_px: float, tools: str = "pan,wheel_zoom,box_zoom,reset,save"
+    *,
+    alt: str,
+    axes: tuple[str, str],
+    height_px: float,
+    legend: Mapping[str, str],
+    tools: str = "pan,wheel_zoom,box_zoom,reset,save",
 ) -> Plot:
     """Return an empty map, true to scale, of a height that leaves room on the first screen."""
     height = int(np.clip(height_px, 330, 420))
-    plot = make_plot("map", alt=alt, axes=axes, height_px=height, tools=tools, drag="pan", match_aspect=True)
+    plot = make_plot(
+        "map", alt=alt, axes=axes, height_px=height, legend=legend, tools=tools, drag="pan", match_aspect=True
+    )
     plot.figure.xgrid.visible = plot.figure.ygrid.visible = False
     plot.figure.axis.formatter.use_scientific = False
     plot.figure.axis.ticker.desired_num_ticks = 4
@@ -168,67 +175,6 @@ def draw_waterfall(distance_by_reason_m: Mapping[str, float]) -> Plot:
     plot.figure.xaxis.formatter.use_scientific = False
     plot.figure.ygrid.visible = False
     return plot
-
-
-def draw_ratios(
-    name: str, label: str, rows: Sequence[tuple[str, tuple[float | None, float | None, float | None]]]
-) -> Plot:
-    """Return ratios as points with their intervals (value, low, high) and a line at 1; at the top the first of ``rows``.
-
-    The colour says on which side of 1 the whole interval lies.
-    """
-    known = [(text, value, low, high) for text, (value, low, high) in rows if value is not None]
-    ends = [(value, value if low is None else low, value if high is None else high) for _, value, low, high in known]
-    colours = [
-        FAINT if low is None or low <= 1.0 <= (high or 0.0) else KEPT if low < 1.0 else DROPPED
-        for _, _, low, high in known
-    ]
-    plot = make_plot(
-        name,
-        alt=f"{label}, a point with its 95 % interval for each; the table lists the same.",
-        axes=(label, ""),
-        legend={"below 1": KEPT, "not significant": FAINT, "above 1": DROPPED},
-        height_px=90 + 20 * len(known),
-        tools="save",
-        x_axis_type="log",
-        y_range=[text for text, *_ in known][::-1],
-        tooltips=[("", "@name"), ("ratio", "@value{0.00} (@low{0.00} to @high{0.00})")],
-    )
-    value, low, high = (list(column) for column in zip(*ends, strict=True)) if ends else ([], [], [])
-    plot.figure.line([1.0, 1.0], [0, max(len(known), 1)], color=FAINT, line_dash="dashed", line_width=2)
-    source = {"name": [text for text, *_ in known], "value": value, "low": low, "high": high, "colour": colours}
-    lines = plot.figure.segment("low", "name", "high", "name", color="colour", line_width=3, source=source)
-    points = plot.figure.scatter("value", "name", size=9, color="colour", source=lines.data_source)
-    plot.figure.hover.renderers = [points]
-    plot.figure.xaxis.ticker.desired_num_ticks = 5
-    plot.figure.xaxis.major_label_policy = NoOverlap()
-    plot.figure.ygrid.visible = False
-    return plot
-
-
-def draw_label_histograms(segments: pa.Table) -> list[Plot]:
-    """Return how often values of each label occur that any segment has; ``alt`` states how many have none."""
-    plots = []
-    labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
-    for label, column in labels.items():
-        values = to_floats(segments, column)
-        finite = values[np.isfinite(values)]
-        if not len(finite):
-            continue
-        lost = f"; {len(values) - len(finite)} have none" if len(finite) < len(values) else ""
-        alt = f"Histogram of {label} of {len(finite)} segments{lost}."
-        plot = make_plot(f"of {column}", alt=alt, axes=(label, "segments"), height_px=220, tools="save", waits=True)
-        counts, edges = np.histogram(finite, bins=min(40, max(5, int(np.sqrt(len(finite))))))
-        plot.figure.quad(left=edges[:-1], right=edges[1:], bottom=0, top=counts, color=SPLIT_COLOURS["train"])
-        plot.figure.add_tools(HoverTool(tooltips=[(label, "@left to @right"), ("segments", "@top")]))
-        plot.figure.y_range.start = 0
-        plots.append(plot)
-    return plots
-
-
-def read_bokeh_script() -> str:
-    """Return the part of BokehJS that a page needs."""
-    return (Path(bokeh.__file__).parent / "server/static/js/bokeh.min.js").read_text(encoding="utf-8")
 
 
 def render_plots(plots: Sequence[Plot]) -> tuple[Json, list[str]]:

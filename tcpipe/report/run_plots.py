@@ -13,12 +13,11 @@ from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.json_files import Json
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.power.rails import is_power_only
-from tcpipe.report.colours import DROPPED, KEPT, LINE_COLOURS, REASON_COLOURS, SEVERITY_COLOURS
+from tcpipe.report.colours import KEPT, LINE_COLOURS, REASON_COLOURS, SEVERITY_COLOURS
 from tcpipe.report.page import Column, make_shown_column, pack_columns
 from tcpipe.report.plots import Plot, add_cursor, make_plot, show_text
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.columns import to_floats, to_integers, to_texts
-from tcpipe.tables.facts import StageFacts
 from tcpipe.tables.findings import Finding
 
 Floats = NDArray[np.float64]
@@ -97,8 +96,6 @@ class Series:
     t_s: Floats
     columns: Mapping[str, Column]
     gap_s: float
-    value_count: int
-    """Before thinning."""
 
     def to_json(self) -> Json:
         """Return the series as the page's script reads it."""
@@ -127,7 +124,7 @@ def downsample_columns(
     kept = {key: make_shown_column(digits, _find_extremes(part, per_bin)) for key, (digits, part) in values.items()}
     kept |= {key: (kind, part[rows]) for key, (kind, part) in (sampled or {}).items()}
     period_s = float(np.median(np.diff(t_s))) if count > 1 else 1.0
-    return Series(name, t_s[rows], kept, max(_GAP_PERIODS * period_s, per_bin * period_s * 2.0, 0.3), count)
+    return Series(name, t_s[rows], kept, max(_GAP_PERIODS * period_s, per_bin * period_s * 2.0, 0.3))
 
 
 def _find_extremes(values: Floats, per_bin: int) -> Floats:
@@ -317,13 +314,12 @@ def time_plots(
     *,
     lines: Sequence[Line],
     spans: Spans,
-    facts: StageFacts,
     rejections: pa.Table,
     has_labels: bool,
     findings: Sequence[FindingSpan] = (),
 ) -> tuple[list[Plot], list[Json]]:
     """Return the plots, one below the other, and the lines as the page's script reads them."""
-    first = _draw_masks(timeline, spans, facts, findings)
+    first = _draw_masks(timeline, spans, findings)
     plots = [first]
     lines_json: list[Json] = []
     for name in dict.fromkeys(line.plot for line in lines):
@@ -378,8 +374,8 @@ def _draw_panel(name: str, label: str, first: Plot, *, legend: Mapping[str, str]
     return plot
 
 
-def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts, findings: Sequence[FindingSpan]) -> Plot:
-    """Return the plot of findings, kept rows, reasons for dropping the others, and events; all plots share its time axis."""
+def _draw_masks(timeline: Timeline, spans: Spans, findings: Sequence[FindingSpan]) -> Plot:
+    """Return the plot of findings, kept rows, and reasons for dropping the others; all plots share its time axis."""
     least_s = 0.004 * timeline.end_s  # so that a moment can be seen
     events = [
         (
@@ -392,12 +388,11 @@ def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts, findings: S
         for span in findings
     ]
     problems = dict.fromkeys(row for row, *_ in events)
-    events += _iterate_events(timeline, facts)
     reasons = [flag_name(bit).replace("_", " ") for bit in DropReason if (spans.bits & int(bit)).any()]
-    rows = [*problems, "kept", *reasons, *dict.fromkeys(row for row, *_ in events if row not in problems)]
+    rows = [*problems, "kept", *reasons]
     plot = make_plot(
         "gates",
-        alt="When findings hold, kept sections of the drive, masks of the rest, and when sensors were rejected or disagreed.",
+        alt="Spans of findings, kept sections of the drive, and masks of the rest.",
         axes=("", ""),
         height_px=40 + 20 * len(rows),
         tools="xbox_zoom",
@@ -413,20 +408,6 @@ def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts, findings: S
         show_text(plot, figure.hbar(y="row", left="left", right="right", height=0.75, color="colour", source=source))
     figure.ygrid.visible = False
     return plot
-
-
-def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str, float, float, str, str]]:
-    """Yield when sensors were rejected: row, start and end [s], colour and text."""
-    events = []
-    for stretch in facts.fuse.stretches if facts.fuse else ():
-        for opened in stretch.gate_resets:
-            role = opened.role.replace("_", " ")
-            text = f"{role} was rejected all this time; difference {opened.size:.2g}"
-            events.append((f"{role} shut out", opened.start_ns, opened.end_ns, stretch.clock_epoch, text))
-    for row, start_ns, end_ns, epoch, text in events:
-        start_s, end_s = timeline.seconds(np.array([start_ns, end_ns]), np.full(2, epoch)).tolist()
-        if np.isfinite(start_s):
-            yield row, start_s, end_s, DROPPED, text
 
 
 def _draw_rejections(timeline: Timeline, first: Plot, rejections: pa.Table) -> Iterator[Plot]:

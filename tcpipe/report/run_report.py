@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
@@ -18,7 +18,7 @@ from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import REPORT
 from tcpipe.formats.runs import Run
 from tcpipe.formats.stored_runs import StoredRun, find_stream_files
-from tcpipe.report.colours import DOUBTED, KEPT, LINE_COLOURS, SEVERITY_COLOURS, UNUSED
+from tcpipe.report.colours import DOUBTED, KEPT, SEVERITY_COLOURS, UNUSED
 from tcpipe.report.label_sections import (
     LABELS,
     QUALITY_WORDS,
@@ -30,11 +30,9 @@ from tcpipe.report.label_sections import (
 )
 from tcpipe.report.maps import RunMap, StoredMaps, draw_run_map
 from tcpipe.report.page import Column, Link, Number, Section, make_shown_column, pack_columns, render_page, show_verdict
-from tcpipe.report.plots import Plot, draw_label_histograms, make_plot, show_text
 from tcpipe.report.run_plots import (
     SPEED_ROLES,
     FindingSpan,
-    Line,
     Series,
     Timeline,
     find_finding_spans,
@@ -49,21 +47,13 @@ from tcpipe.report.run_plots import (
 )
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import NoiseFacts, PhysicsFacts, StageFacts
+from tcpipe.tables.facts import PhysicsFacts, StageFacts
 from tcpipe.tables.findings import SEVERITIES, Finding, rank_severity, read_catalogue
 
-_NOISE = (
-    "Noise of the sensors: how much the error of each changes over a time difference (1σ).\n"
-    "Line: fitted to the longest section of the run; dashed: by the "
-    "covariances of its messages, were their errors independent. A filled circle: the run determines more than half of the "
-    "variance; an empty one: it is mostly what tcpipe assumes of such sensors."
+_OVER_TIME = (
+    "Shaded: excluded, in the colour of the reason. Draw a box to zoom, double-click for the whole run; all plots follow.\n"
+    "Where many values share a pixel, the line shows their minimum and maximum."
 )
-_NOISE_PLOTS = {
-    "m": ("noise", "position, or distance driven [m]", 1.0),
-    "rad": ("noise of turns", "angle turned [°]", 180.0 / np.pi),
-}
-"""By unit of the facts: name of the plot, label and factor of its axis."""
-_TURN = " turn"
 _STEP_M = 0.05
 """Positions of the track that are nearer become one on the map."""
 
@@ -134,7 +124,6 @@ def _draw_run(run: StoredRun, track: pa.Table, segments: pa.Table, *, rejections
         timeline,
         lines=lines,
         spans=spans,
-        facts=info.report.facts,
         rejections=rejections,
         has_labels=bool(segments.num_rows),
         findings=findings,
@@ -165,12 +154,12 @@ def _draw_run(run: StoredRun, track: pa.Table, segments: pa.Table, *, rejections
         "tall_by_wide": float(np.divide(*np.maximum(np.ptp(run_map.track_xy_m, axis=0), 1.0)[::-1])),
     }
     text = "Click on the track or a plot for details."
-    over = " ".join([_describe_series(series, lines), *lost])
+    over = [_OVER_TIME, *([] if any(line.plot == "power" for line in lines) else ["There is no power."]), *lost]
     first, *others = over_time
     drive = Section(
         "The drive", " ".join([text, *run_map.missing]), controls="run.html", plots=[run_map.plot, first], stacked=True
     )
-    over_time_section = Section("Over time", over, controls="run_time.html", plots=others, stacked=True)
+    over_time_section = Section("Over time", " ".join(over), controls="run_time.html", plots=others, stacked=True)
     return _Drive([drive, over_time_section], data, is_complete=run_map.is_complete and not lost)
 
 
@@ -188,23 +177,6 @@ def _read_series(run: StoredRun, timeline: Timeline) -> tuple[list[Series], list
         tables.pop("gnss", None)
     speeds = [make_speed_series(role, table, timeline) for role, table in tables.items()]
     return [*series, *(part for part in speeds if part is not None)], []
-
-
-def _describe_series(series: Sequence[Series], lines: Sequence[Line]) -> str:
-    """Return the text above the plots over time, with the series that are thinned."""
-    text = (
-        "Shaded: excluded, in the colour of the reason. Draw a box to zoom, double-click for the whole run; all plots follow.\n"
-        "Where many values share a pixel, the line shows their minimum and maximum."
-    )
-    if not any(line.plot == "power" for line in lines):
-        text += " There is no power."
-    for part in series:
-        if len(part.t_s) < part.value_count:
-            text += (
-                f" {part.name.replace('_', ' ')}: {part.value_count} values; the page contains the minimum and maximum of every "
-                f"{-(-2 * part.value_count // len(part.t_s))}."
-            )
-    return text
 
 
 def _make_segments_data(
@@ -265,29 +237,20 @@ def _make_label_sections(run: StoredRun, segments: pa.Table, physics: PhysicsFac
         make_quality_section(to_integers(segments, "quality"), "segments"),
         *make_budget_sections(run.facts.energy_budget),
     ]
-    return [Section("Labels", "One value per segment.", plots=draw_label_histograms(segments), parts=parts)]
+    return [Section("Labels", "One value per segment.", parts=parts)]
 
 
 def _make_sensor_section(manifest: Run, rejections: pa.Table) -> Section:
-    """Return the section on topics, rejections, noise and clocks."""
+    """Return the section on topics, rejections and clocks."""
     facts = manifest.info.report.facts
-    plots = list(_draw_noises(facts))
-    parts = [
-        _make_topics_section(manifest),
-        *_make_trust_sections(facts, rejections),
-        *_make_clock_sections(facts),
-    ]
-    return Section("Sensors", _NOISE if plots else "", plots=plots, parts=parts)
-
-
-def _name(role: str) -> str:
-    return role.replace("_", " ")
+    parts = [_make_topics_section(manifest), *_make_trust_sections(facts, rejections), *_make_clock_sections(facts)]
+    return Section("Sensors", parts=parts)
 
 
 def _make_topics_section(manifest: Run) -> Section:
     rows = [
         (
-            *(_name(role), sensor.topic, sensor.type_name, manifest.counts.messages.get(role, 0)),
+            *(role.replace("_", " "), sensor.topic, sensor.type_name, manifest.counts.messages.get(role, 0)),
             *(sensor.time_source, sensor.placed_by, sensor.why),
         )
         for role, sensor in sorted(manifest.sensors.items())
@@ -303,7 +266,7 @@ def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Sectio
     checks = facts.sensor_checks.excluded if facts.sensor_checks else {}
     rows = [
         (
-            _name(role),
+            role.replace("_", " "),
             counts.get(role, 0),
             ", ".join(f"{count} {why}" for (name, why), count in sorted(lost.items()) if name == role),
             "" if (mean := nis.get(role)) is None else f"{mean:.2f}",
@@ -322,63 +285,13 @@ def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Sectio
     return [Section("Rejected measurements by sensor", text, header=header, rows=rows)]
 
 
-def _draw_noises(facts: StageFacts) -> Iterator[Plot]:
-    """Yield the plots of the noise of the sensors; none of a run whose estimator does not fit it."""
-    stretches = [each for each in (facts.fuse.stretches if facts.fuse else ()) if each.noise]
-    if not stretches:
-        return
-    noise = max(stretches, key=lambda each: each.end_ns - each.start_ns).noise
-    sensors = list(dict.fromkeys(name.removesuffix(_TURN) for name in noise))
-    for unit in _NOISE_PLOTS:
-        drawn = {name: each for name, each in noise.items() if each.unit == unit}
-        if drawn:
-            yield _draw_noise(unit, drawn, [sensors.index(name.removesuffix(_TURN)) for name in drawn])
-
-
-def _draw_noise(unit: str, noise: Mapping[str, NoiseFacts], numbers: Sequence[int]) -> Plot:
-    """Return the plot of sensors of one unit; a sensor has the colour of its number in the other plot, too."""
-    name, label, factor = _NOISE_PLOTS[unit]
-    colours = {each.replace("_", " "): LINE_COLOURS[k] for each, k in zip(noise, numbers, strict=True)}
-    plot = make_plot(
-        name,
-        alt=f"σ of the error in {label} over time differences, for {', '.join(colours)}: fitted to the run, and as claimed.",
-        axes=("time difference [s]", f"σ of {label}"),
-        legend=colours,
-        tools="save",
-        waits=True,
-        x_axis_type="log",
-        y_axis_type="log",
-    )
-    for (sensor, colour), each in zip(colours.items(), noise.values(), strict=True):
-        std, claimed = (factor * np.array(values) for values in (each.std, each.claimed_std))
-        plot.figure.line(each.time_s, claimed, color=colour, line_dash="dashed", line_width=1.3)
-        plot.figure.line(each.time_s, std, color=colour, line_width=1.8)
-        source = {
-            "x": each.time_s,
-            "y": std,
-            "fill": [float(share > 0.5) for share in each.data_share],
-            "text": _describe_noise(sensor, each, std, claimed, "m" if unit == "m" else "°"),
-        }
-        show_text(plot, plot.figure.scatter("x", "y", size=7, color=colour, fill_alpha="fill", source=source))
-    return plot
-
-
-def _describe_noise(
-    sensor: str, each: NoiseFacts, std: NDArray[np.float64], claimed: NDArray[np.float64], unit: str
-) -> list[str]:
-    return [
-        f"{sensor} over {time_s:g} s: {fitted:.2g} {unit} fitted, {stated:.2g} {unit} claimed, {share:.0%} by the data"
-        for time_s, fitted, stated, share in zip(each.time_s, std, claimed, each.data_share, strict=True)
-    ]
-
-
 def _make_clock_sections(facts: StageFacts) -> list[Section]:
     """Return the time offset of each sensor, if any could be compared."""
     steps = [f"{step.step_s:+.3f} s at log time {step.log_time_ns} ns" for step in facts.clock_steps]
     rows = [
         (
-            _name(role),
-            _name(clocks.reference),
+            role.replace("_", " "),
+            clocks.reference.replace("_", " "),
             f"{round(1e3 * offset.offset_s) + 0:+d} ms",
             f"{2e3 * offset.std_s:.0f} ms",
         )

@@ -9,7 +9,7 @@ page.start(() => {
   const columns = [
     ["run", (run) => run.run], ["start_ms", (run) => date(run.start_ms), 1], ["robot", (run) => run.robot], ["state", state_of],
     ["datasets", (run) => run.datasets.map((n) => facts.datasets[n]).join(", ")], ["tags", (run) => run.tags],
-    ["segments", digits("segments", 0), 1], ["driven", digits("driven", 0), 1], ["used", digits("used", 1), 1], ["floor", digits("floor", 2), 1],
+    ["segments", digits("segments", 0), 1], ["driven", digits("driven", 0), 1], ["energy", digits("energy", 1), 1], ["wh_per_km", digits("wh_per_km", 1), 1], ["used", digits("used", 1), 1], ["floor", digits("floor", 2), 1],
     ["verdict", (run) => run.verdict], ["findings", digits("findings", 0), 1],
   ];
 

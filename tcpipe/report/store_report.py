@@ -31,8 +31,8 @@ MOST_ROWS = 200
 _MOST_LISTED = 500
 
 _COLUMNS = (
-    *("run", "began (UTC)", "robot", "state", "in datasets", "tags", "segments", "driven [m]", "used [%]"),
-    *("noise floor of E [%]", "verdict", "findings"),
+    *("run", "began (UTC)", "robot", "state", "in datasets", "tags", "segments", "driven [m]", "E [Wh]", "Wh/km"),
+    *("used [%]", "noise floor of E [%]", "verdict", "findings"),
 )
 
 
@@ -95,16 +95,6 @@ class RunRow:
     is_current: bool = False
     """Whether it counts: it is of the current recipe, complete, and not superseded."""
 
-    @property
-    def used_share(self) -> float | None:
-        """Return the share of the metres driven that are in segments."""
-        return self.facts.kept_m / self.facts.driven_m if self.facts.driven_m > 0 else None
-
-    @property
-    def floor(self) -> float | None:
-        """Return the noise floor of E, a share."""
-        return self.facts.energy_budget.total if self.facts.energy_budget else None
-
     def row(self, terms: Sequence[str]) -> list[Json]:
         """Return the values of `_FIELDS` for the page's script."""
         facts = self.facts
@@ -118,8 +108,10 @@ class RunRow:
             ", ".join(f"{key}={value}" for key, value in facts.tags.items()),
             facts.segments,
             round(facts.driven_m, 1),
-            _compute_percent(self.used_share),
-            _compute_percent(self.floor),
+            None if facts.energy_joule is None else round(facts.energy_joule / 3600, 2),
+            None if facts.wh_per_km is None else round(facts.wh_per_km, 1),
+            round(100.0 * facts.kept_m / facts.driven_m, 2) if facts.driven_m > 0 else None,
+            round(100.0 * facts.energy_budget.total, 2) if facts.energy_budget else None,
             facts.verdict.worst,
             sum(finding.severity != "note" for finding in facts.findings),
             list(self.datasets),
@@ -130,8 +122,8 @@ class RunRow:
 
 
 _FIELDS = (
-    *("run", "href", "start_ms", "robot", "state", "superseded_by", "tags", "segments", "driven", "used", "floor"),
-    *("verdict", "findings", "datasets", "codes", "idle", "terms"),
+    *("run", "href", "start_ms", "robot", "state", "superseded_by", "tags", "segments", "driven"),
+    *("energy", "wh_per_km", "used", "floor", "verdict", "findings", "datasets", "codes", "idle", "terms"),
 )
 
 
@@ -147,14 +139,12 @@ def sort_runs(store: StoreFacts) -> list[RunRow]:
     rows = list[RunRow]()
     for facts in store.rows:
         key, why_not = (facts.run_id, facts.recipe_id), _find_why_not_current(facts, store)
-        state = why_not or _describe_defect(facts, store) or "current"
+        defect = facts.defect and f"{facts.defect}{', acknowledged' * (facts.run_id in store.acknowledged)}"
+        state = why_not or defect or "current"
         its_codes = () if why_not else tuple(codes.get(facts.run_id, ()))
         rows.append(RunRow(state, facts, store.pages.get(key, ""), tuple(members.get(key, ())), its_codes, not why_not))
-    return sorted(rows, key=_rank)
-
-
-def _rank(row: RunRow) -> tuple[int, str, bool, str]:
-    return -(row.facts.start_ns or 0), row.facts.run_id, not row.is_current, row.facts.recipe_id
+    rows.sort(key=lambda row: (row.facts.run_id, not row.is_current, row.facts.recipe_id))
+    return sorted(rows, key=lambda row: -(row.facts.start_ns or 0))
 
 
 def _find_why_not_current(facts: RunFacts, store: StoreFacts) -> str:
@@ -168,29 +158,14 @@ def _find_why_not_current(facts: RunFacts, store: StoreFacts) -> str:
     return _OTHER_RECIPE if facts.ingest_key != store.ruling else ""
 
 
-def _describe_defect(facts: RunFacts, store: StoreFacts) -> str:
-    return facts.defect and f"{facts.defect}{', acknowledged' * (facts.run_id in store.acknowledged)}"
-
-
-def _compute_percent(share: float | None) -> float | None:
-    return None if share is None else round(100.0 * share, 2)
-
-
 def name_datasets(datasets: Sequence[StoredDataset]) -> list[str]:
     """Return a unique name of each dataset: the last part of its path, or the whole path."""
     short = [PurePosixPath(dataset.out).name for dataset in datasets]
     return [name if short.count(name) == 1 else dataset.out for name, dataset in zip(short, datasets, strict=True)]
 
 
-def format_day(facts: RunFacts) -> str:
-    """Return when the first segment of a run begins, to the minute, UTC; "" without segments."""
-    if facts.start_ns is None:
-        return ""
-    return f"{datetime.fromtimestamp(facts.start_ns // 10**9, UTC):%Y-%m-%d %H:%M}"
-
-
-def store_report(store: StoreFacts) -> str:
-    """Return the HTML page of a store."""
+def store_report(store: StoreFacts, tracks: Plot | None = None) -> str:
+    """Return the HTML page of a store; of few runs, with their ``tracks`` on the map, these and the table come first."""
     runs = sort_runs(store)
     current = [run for run in runs if run.is_current]
     groups = [(group, len(current), "runs") for group in store.groups]
@@ -207,8 +182,9 @@ def store_report(store: StoreFacts) -> str:
         numbers=_make_numbers(store, current),
         warnings=[] if current else [problem],
         sections=[
+            *([Section("Tracks", plots=[tracks]), *table] if tracks else []),
             *(drift or losses),
-            *table,
+            *([] if tracks else table),
             *(losses if drift else []),
             *_make_datasets_sections(store, runs),
             *_make_problem_sections(store, runs),
@@ -220,11 +196,8 @@ def store_report(store: StoreFacts) -> str:
 
 def _make_numbers(store: StoreFacts, current: Sequence[RunRow]) -> list[Number]:
     facts = [run.facts for run in current]
-    driven_m, kept_m = (
-        math.fsum(run_facts.driven_m for run_facts in facts),
-        math.fsum(run_facts.kept_m for run_facts in facts),
-    )
-    floors = [run.floor for run in current if run.floor is not None]
+    driven_m, kept_m = (math.fsum(getattr(each, name) for each in facts) for name in ("driven_m", "kept_m"))
+    floors = [each.energy_budget.total for each in facts if each.energy_budget]
     return [
         Number(f"{len(current)}", "runs"),
         Number(f"{sum(run_facts.segments for run_facts in facts)}", "segments"),
@@ -243,13 +216,14 @@ def _make_table_section(store: StoreFacts, runs: Sequence[RunRow]) -> list[Secti
     rows = [
         (
             Link(run.facts.run_id, run.href) if run.href else run.facts.run_id,
-            format_day(run.facts),
+            "" if start_ns is None else f"{datetime.fromtimestamp(start_ns // 10**9, UTC):%Y-%m-%d %H:%M}",
             run.facts.robot,
             f"superseded by {run.facts.superseded_by}" if run.facts.superseded_by else run.state,
             ", ".join(names[number] for number in run.datasets),
-            *("" if cell is None else cell for cell in run.row([])[6:13]),
+            *("" if cell is None else cell for cell in run.row([])[6:15]),
         )
         for run in runs[:MOST_ROWS]
+        for start_ns in (run.facts.start_ns,)
     ]
     text = "Click a column head to sort; a selection in the plots filters the table."
     if len(runs) > MOST_ROWS:
@@ -261,8 +235,8 @@ def _make_drift_sections(runs: Sequence[RunRow]) -> list[Section]:
     """Return the plots over time; the page's script fills them."""
     dated = [run for run in runs if run.facts.start_ns is not None]
     is_known = {
-        "metres used [%]": ("used", any(run.used_share is not None for run in dated)),
-        "noise floor of E [%]": ("floor", any(run.floor is not None for run in dated)),
+        "metres used [%]": ("used", any(run.facts.driven_m > 0 for run in dated)),
+        "noise floor of E [%]": ("floor", any(run.facts.energy_budget for run in dated)),
         "idle power [W]": ("idle", any(run.facts.idle_watt is not None for run in dated)),
         "term of physics": ("term", any(run.facts.physics for run in dated)),
     }

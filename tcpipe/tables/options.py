@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
+from difflib import get_close_matches
 from inspect import cleandoc, signature
 from math import isfinite
 from typing import Any, NamedTuple, ParamSpec, TypeVar
@@ -49,13 +50,13 @@ RECIPE = Option(
     "Recipe (or TCPIPE_RECIPE, or the nearest tcpipe.toml upward; else defaults).", (), "input_file", "FILE"
 )
 MESSAGE_DEFINITIONS = Option(
-    "Directory of package/msg/Name.msg (or .idl) files for types the log does not define.", ("--msgdef",), "input_directory", "DIR"
+    "Directory of package/msg/Name.msg (or .idl) files for types the log does not define.", (), "input_directory", "DIR"
 )  # fmt: skip
-MAP = Option("Map to look at (default: the only one in the store).", ("--map",), "map", "NAME")
+MAP = Option("Map to look at (default: the only one in the store).", (), "map", "NAME")
 MODEL = Option(kind="sealed", metavar="MODEL", is_argument=True)
 SPEED = Option(
     "Commanded speed, for a model trained with --extra-features (default: the mean of its training).",
-    ("--speed",),
+    (),
     Range(0.0, 100.0, is_open=True),
     "MPS",
 )
@@ -82,21 +83,26 @@ def jobs(what: str) -> Any:
 
 def tags(about: str) -> Any:
     """Return the field of ``--tag``."""
-    return option(None, Option(about, ("--tag",), "tags", "K=V"))
+    return option(None, Option(about, (), "tags", "K=V"))
 
 
 def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R]:
     """Return the public function of a command: its keywords are the fields of the options, and ``run`` does the work."""
+    name = run.__name__.removeprefix("run_")
+    shown = {entry.name: entry.metadata.get("option", Option()) for entry in fields(options)}  # type: ignore[arg-type]
+    words = {flag.strip("-"): keyword for keyword, option in shown.items() for flag in (keyword, *option.flags)}
 
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        for word in kwargs.keys() - shown.keys():
+            close = words[get_close_matches(word, words, 1, cutoff=0.0)[0]]
+            raise TypeError(f"{name}: no keyword {word!r}; did you mean {close!r}?")
         asked = options(*args, **kwargs)
-        _check_bounds(asked, run.__name__.removeprefix("run_"))
+        _check_bounds(asked, name)
         return run(asked)
 
-    shown = {entry.name: entry.metadata.get("option", Option()).about for entry in fields(options)}  # type: ignore[arg-type]
-    lines = [f"{name} : {about}" for name, about in shown.items() if about]
+    lines = [f"{keyword} : {option.about}" for keyword, option in shown.items() if option.about]
     more = f"`{getattr(options, '__module__', '')}` describes each of them."
-    call.__name__ = call.__qualname__ = run.__name__.removeprefix("run_")
+    call.__name__ = call.__qualname__ = name
     call.__module__ = run.__module__
     call.__doc__ = "\n".join([cleandoc(run.__doc__ or ""), "", "Parameters", "----------", *lines, "", more])
     call.__signature__ = signature(options).replace(return_annotation=signature(run).return_annotation)  # type: ignore[attr-defined]

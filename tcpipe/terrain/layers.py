@@ -18,11 +18,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tcpipe.tables.facts import LEFT_OUT
 
 NODATA_ID = 0
 """The id of pixels without a class."""
@@ -38,6 +40,8 @@ class TerrainClass:
     id: int
     name: str
     traversable: bool
+    color: str | None = field(default=None, compare=False, repr=False, metadata=LEFT_OUT)
+    """Colour on pages, ``#rrggbb``; None: by its name."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ def built(tmp_path_factory):
     store = small_store(directory)
     region = region_file(directory / "region.geojson", REGION)
     results = {
-        name: build_dataset(directory / name, store=store.root, split=region, recipe=RECIPE, file_format=name)
+        name: build_dataset(directory / name, store=store.root, split=region, recipe=RECIPE, format=name)
         for name in ("zarr", "parquet")
     }
     return directory, store, region, results

@@ -6,7 +6,7 @@ from time import monotonic
 
 import pytest
 from browser_page import quiet_page
-from synthetic_store import add_run, driven, lanes, make_noise_facts, open_world, segments
+from synthetic_store import add_run, driven, lanes, open_world, segments
 
 import tcpipe
 from tcpipe.learning.evaluation import EvaluateConfig
@@ -265,7 +265,7 @@ def test_of_a_part_of_the_samples_the_page_says_what_a_selection_covers(chromium
         said = tab.locator("#selection-count").inner_text()
         assert "The selection covers the 30 samples that the page shows, drawn at random from 144." in said
         assert tab.get_by_text("not in this page").count() > 0
-        assert "'tcpipe report --patches' puts all beside it" in tab.locator("#no-picture").inner_text()
+        assert "tcpipe.open_dataset reads all" in tab.locator("#no-picture").inner_text()
 
 
 def test_it_is_worked_by_keyboard(opened):
@@ -312,31 +312,6 @@ def test_the_store_s_page_fits_sorts_filters_and_leads_to_runs(store_page):
     assert first.get_attribute("href").endswith("/report.html")
 
 
-def test_a_patch_that_is_not_inside_the_page_comes_from_the_folder_beside_it(chromium, dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr("tcpipe.report.pictures.MOST_PATCHES", 5)
-    there = tmp_path / "dataset"
-    shutil.copytree(dataset, there)
-    report(there, patches=True)
-    tab = chromium.new_page()
-    answered = []
-    tab.on("response", lambda found: None if found.url.startswith("blob:") else answered.append(found.url))
-    tab.goto((there / "report.html").as_uri())
-    tab.wait_for_selector("html[data-ready]")
-    rows = tab.evaluate("page.data.patches.rows")
-    tab.evaluate(f"{SOURCE}.selected.indices = [[...{SOURCE}.data.x.keys()].find((i) => !{rows}.includes(i))]")
-    assert tab.locator("#chosen .patch").count() == 3
-    tab.wait_for_timeout(500)
-    assert tab.locator("#chosen .patch").count() == 3  # and is not replaced by a note that the folder is gone
-    assert {url.rpartition("/")[2] for url in answered} == {"report.html", "0-0.webp", "1-0.webp", "2-0.webp"}
-    for picture in there.rglob("*.webp"):
-        picture.unlink()
-    tab.reload()
-    tab.wait_for_selector("html[data-ready]")
-    tab.evaluate(f"{SOURCE}.selected.indices = [[...{SOURCE}.data.x.keys()].find((i) => !{rows}.includes(i))]")
-    tab.get_by_text("is not beside this page").first.wait_for()
-    tab.close()
-
-
 def list_findings():
     """A warning from the twelfth to the fourteenth second, and one with a remedy."""
     step = make_finding(
@@ -359,7 +334,6 @@ def run_page(tmp_path_factory):
         table,
         track=driven(table),
         tags={"site": "<b>\x1b[31m'\"&"},
-        facts=make_noise_facts(),
         findings=list_findings(),
     )
     return Path(report("driven", store=store.root)[0].path)
@@ -406,20 +380,6 @@ def test_a_run_is_worked_by_keyboard_and_all_its_plots_zoom_as_one(driving):
     until(driving, f"page.model('line 0').data_source.data.t.every((t) => t > {zoomed[0] - 0.1})")
     driving.select_option("#label", "E")
     assert driving.evaluate("page.model('label plot').left[0].axis_label") == "E [J], ± σ"
-
-
-def test_the_noise_of_sensors_is_drawn_and_says_how_much_the_data_tell(driving):
-    plot = driving.locator("figure[aria-label*='fitted to the run']").first
-    said = driving.get_by_text("wheel odometry over 10 s: 0.2 m fitted, 0.01 m claimed, 50% by the data")
-    give_up = monotonic() + 60.0
-    while not said.is_visible():  # plots above are drawn when they come into view, which moves this one out of it
-        assert monotonic() < give_up, "a point of the noise plot says nothing"
-        plot.scroll_into_view_if_needed()
-        until(driving, "page.plots.some((one) => one.model.name === 'noise')")
-        x, y = driving.evaluate(PLACE, ["noise", 10.0, 0.2])
-        driving.mouse.move(x + 2.0, y)
-        driving.mouse.move(x, y)
-        driving.wait_for_timeout(50)
 
 
 MAP_COLOURS = """() => Object.fromEntries(["track", "segments", "findings"].map((name) => {

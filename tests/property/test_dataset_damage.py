@@ -24,7 +24,7 @@ def made(tmp_path_factory):
     store = open_world(directory)
     add_run(store, "a", segments("a", *lanes(0.0, -6.0, 6.0)))
     for name in FORMATS:
-        build_dataset(directory / name, store=store.root, recipe=Recipe(), holdout="sample", file_format=name)
+        build_dataset(directory / name, store=store.root, recipe=Recipe(), holdout="sample", format=name)
     return directory
 
 

@@ -17,9 +17,9 @@ from tcpipe.simulation import simulate
 from tcpipe.store import open_store
 
 TEXTS = {
-    "name", "robot", "cluster", "map_name", "tags", "sample_id", "scenario", "names", "topics", "crs",
-    "start", "goal", "holdout", "strays", "shard", "min_age_s", "forget", "drives",
-    "adapt", "budget_joule", "labels", "layers", "predictor", "reason", "run", "runs",
+    "name", "robot", "cluster", "map", "tag", "sample_id", "scenario", "names", "topics", "crs",
+    "start", "goal", "holdout", "strays", "shard", "min_age", "min_age_s", "forget", "drive",
+    "adapt", "budget", "labels", "layers", "predictor", "reason", "run", "runs",
     "split", "time", "train", "unused", "xy",
 }  # fmt: skip
 """Parameters of commands that are text and no path."""

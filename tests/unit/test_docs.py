@@ -215,7 +215,7 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     store = small_store(here)
     region = region_file(here / "region.geojson", box(-18, -18, 6, 18))
     for name, file_format in (("dataset", "zarr"), ("dataset-parquet", "parquet")):
-        build_dataset(here / name, store=store.root, split=region, recipe=Recipe(), file_format=file_format)
+        build_dataset(here / name, store=store.root, split=region, recipe=Recipe(), format=file_format)
     return here
 
 

@@ -66,6 +66,9 @@ def test_every_option_is_a_keyword_with_the_same_default(name):
     options = _options(name)
     assert set(parameters) - {"on_step"} == set(options)
     for keyword, option in options.items():
+        words = {flag.strip("-").replace("-", "_") for flag in option.opts}
+        assert keyword in words, "a keyword is a word of the command line"
+    for keyword, option in options.items():
         default = parameters[keyword].default
         if option.required:
             assert default is inspect.Parameter.empty
@@ -81,7 +84,7 @@ RANGED = [
     (name, keyword, option.type)
     for name in FUNCTIONS
     for keyword, option in _options(name).items()
-    if isinstance(option.type, click.IntRange | click.FloatRange) and keyword != "speed_mps"
+    if isinstance(option.type, click.IntRange | click.FloatRange) and keyword != "speed"
 ]
 
 
@@ -110,6 +113,22 @@ def test_a_function_refuses_what_its_command_refuses(name, keyword, bounds, tmp_
 def test_a_word_that_is_no_choice_is_refused(call):
     with pytest.raises(UsageError, match="expected"):
         call()
+
+
+@pytest.mark.parametrize(
+    ("function", "word", "right"),
+    [
+        (tcpipe.build_dataset, "map_name", "map"),
+        (tcpipe.build_dataset, "file_format", "format"),
+        (tcpipe.ingest, "message_definitions", "msgdef"),
+        (tcpipe.ingest, "tags", "tag"),
+        (tcpipe.plan_path, "to", "goal"),
+        (tcpipe.evaluate, "drives", "drive"),
+    ],
+)
+def test_an_unknown_keyword_names_the_right_one(function, word, right):
+    with pytest.raises(TypeError, match=rf"^{function.__name__}: no keyword '{word}'; did you mean '{right}'\?$"):
+        function("x", **{word: "y"})
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +160,7 @@ def test_the_functions_give_what_the_commands_print(place, monkeypatch):
     assert found.values.config == EvaluateConfig(noise_draws=2)
     said = _said(here, "evaluate", "model", "dataset", "again", "--noise-draws", "2", "--quiet")
     assert said["splits"]["test"]["errors"]["E"]["all"]["rmse"] == found.values.splits["test"].errors["E"]["all"].rmse
-    drives = tcpipe.evaluate("model", "dataset", "drives", drives=["north"], map_name="site", store=store)
+    drives = tcpipe.evaluate("model", "dataset", "drives", drive=["north"], map="site", store=store)
     (drive,) = drives.values.drives
     assert drive.run_id == "north"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from io import StringIO
@@ -294,7 +295,7 @@ MAX_BYTES = 2_000_000
 _SHOWN = 20
 _INT64 = 2**63
 
-_COLUMNS = ("value", "id", "name", "traversable")
+_COLUMNS, _COLOR = ("value", "id", "name", "traversable"), "color"
 _TRUTH = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
 
@@ -349,7 +350,9 @@ def _parse_entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], 
         return None
     problems += [f"{where}: {name} is missing" for name in _COLUMNS if row.get(name) in (None, "", "?")]
     problems += [
-        f"{where}: {name!r} is not a column (expected {', '.join(_COLUMNS)})" for name in row if name not in _COLUMNS
+        f"{where}: {name!r} is not a column (expected {', '.join(_COLUMNS)})"
+        for name in row
+        if name not in {*_COLUMNS, _COLOR}
     ]
     if len(problems) > before:
         return None
@@ -369,7 +372,13 @@ def _parse_entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], 
     if not name.isprintable():
         problems.append(f"{where}: name {name!r} contains characters that cannot be printed")
         return None
-    return [value for value in values if value is not None], TerrainClass(class_id, name, traversable=traversable)
+    color = str(row.get(_COLOR) or "").strip() or None
+    if color and re.fullmatch(r"#[0-9a-fA-F]{6}", color) is None:
+        problems.append(f"{where}: color {color!r} is not of the form #rrggbb")
+        return None
+    return [value for value in values if value is not None], TerrainClass(
+        class_id, name, traversable=traversable, color=color
+    )
 
 
 def _integer(value: Any) -> int | None:

@@ -40,20 +40,20 @@ class BuildOptions:
 
 def read_build_options(options: BuildDatasetOptions, recipe: Recipe) -> BuildOptions:
     """Return a user's choices for a dataset, read and checked."""
-    split, map_name = options.split, options.map_name
+    split, map_name = options.split, options.map
     if options.without_patches and map_name:
         raise UsageError("--map, --without-patches: samples without patches need no map; remove one of them")
     tables = [options.covariates] if isinstance(options.covariates, str | Path) else options.covariates
     return BuildOptions(
         recipe=recipe,
         robot=options.robot or recipe.robot,
-        tags=options.tags or {},
+        tags=options.tag or {},
         map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
         labels=parse_labels(options.labels),
         without_patches=options.without_patches,
         regions=None if split is None else read_regions(Path(split)),
         covariates=read_all_covariates([Path(path) for path in tables], recipe.covariates),
-        file_format=options.file_format,
+        file_format=options.format,
         without_coordinates=options.without_coordinates,
     )
 

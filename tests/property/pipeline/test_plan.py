@@ -114,13 +114,13 @@ def test_what_status_predicts_is_what_ingest_does(row, actions):
                     acknowledge([str(logs / f"log{rest[0]}.mcap")], store=store)
             else:
                 recipe, how = rest
-                compare(logs, store, worked, recipe=recipe, min_age_s=60.0, **how)
+                compare(logs, store, worked, recipe=recipe, min_age=60.0, **how)
 
 
 def compare(logs, store, worked, **how):
     predicted = {
         name: group.state
-        for group in find_status(IngestOptions([logs], store=store, **{"min_age_s": 600.0, **how}), create=True).groups
+        for group in find_status(IngestOptions([logs], store=store, **{"min_age": 600.0, **how}), create=True).groups
         for name in group.logs
     }
     before, worked[:] = Store(store).scan(), []

@@ -140,3 +140,17 @@ def test_a_name_is_shown_as_text(screen):
     shown.step(Step(HOSTILE, "fusing", 0, 0))
     assert all(c.isprintable() or c == "\n" for c in drawn())
     assert "[red]a\\x1b" in drawn()
+
+
+def test_a_bar_fills_from_part_to_part_and_within_each(capsys):
+    with Progress("demo", quiet=False, console=Console(force_terminal=True, file=io.StringIO())) as shown:
+        done = []
+        for number, text in enumerate(("simulating", "ingesting")):
+            shown.begin_part(number, total=2, text=text)
+            done.append(shown._bars.tasks[0].completed)
+            shown.step(Step("a.bag", "reading", 30, 100))
+            done.append(shown._bars.tasks[0].completed)
+    assert done == [0, 0.3, 1, 1.3]
+    with Progress("demo", quiet=False, console=None) as shown:
+        shown.begin_part(0, total=2, text="simulating")
+    assert capsys.readouterr() == ("", "simulating\n")

@@ -65,3 +65,23 @@ def test_a_signal_before_the_command_begins_is_one_line_too():
         143,
         "tcpipe: ended by SIGTERM; no output is incomplete; run the same command again\n",
     )
+
+
+def test_an_import_that_a_signal_breaks_is_no_internal_error():
+    program = """
+import os, signal, time
+from tcpipe import cli
+
+def load(**_):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(10.0)
+    except KeyboardInterrupt:
+        raise ImportError("an extension is half loaded")
+
+cli.cli.main = load
+cli.main()
+"""
+    done = subprocess.run([sys.executable, "-c", program, "demo"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "tcpipe: ended by SIGINT; no output is incomplete; run the same command again\n"

@@ -22,7 +22,7 @@ def directory(tmp_path_factory):
     store = small_store(directory)
     region = region_file(directory / "region.geojson", box(-20, -20, 5, 20))
     for name in ("zarr", "parquet"):
-        build_dataset(directory / name, store=store.root, split=region, recipe=Recipe(), file_format=name)
+        build_dataset(directory / name, store=store.root, split=region, recipe=Recipe(), format=name)
     return directory
 
 

@@ -342,7 +342,7 @@ def test_status_without_logs_asks_each_folder_as_the_call_was_that_was_given_it(
     for path in parts.iterdir():
         os.utime(path, ns=(10**18, 10**18))
     assert ingest([parts], store=store, recipe=Recipe(), as_one=True).exit_code == 0
-    assert ingest([logs], store=store, recipe=Recipe(), message_definitions=definitions).exit_code == 0
+    assert ingest([logs], store=store, recipe=Recipe(), msgdef=definitions).exit_code == 0
     found = ask_status(store)
     assert (found.counts, found.problems) == ({"done": 3}, ())
     assert ask_status(store, parts).counts == {"pending": 2}

@@ -37,7 +37,7 @@ def store(made, tmp_path):
 
 
 def runs(store, tmp_path, **tags):
-    build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), tags=tags, force=True)
+    build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), tag=tags, force=True)
     return [run.run_id for run in open_dataset(tmp_path / "out").card.runs]
 
 
@@ -49,7 +49,7 @@ def test_a_run_needs_all_of_the_tags(store, tmp_path):
 
 def test_a_tag_that_no_run_has_is_answered_with_those_there_are(store, tmp_path):
     with pytest.raises(DatasetError) as caught:
-        build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), tags={"weather": "snow"})
+        build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), tag={"weather": "snow"})
     (line,) = caught.value.problems
     assert "no run is tagged weather=snow" in line
     assert "driver=Eva, weather=dry, weather=wet" in line

@@ -145,7 +145,7 @@ def ingested(tmp_path_factory):
     drive_at(here / "logs" / "one.mcap")
     drive_at(here / "logs" / "two.mcap", seed=1, start_ns=START_NS + 10**13)
     ingest([here / "logs"], store=here / "store", recipe=Recipe())
-    ingest([here / "logs" / "one.mcap"], store=here / "store", recipe=Recipe(), tags={"load": "12"})
+    ingest([here / "logs" / "one.mcap"], store=here / "store", recipe=Recipe(), tag={"load": "12"})
     return here
 
 

@@ -13,7 +13,7 @@ class _Begun(Exception):  # noqa: N818
 @pytest.mark.parametrize(
     ("module", "run"),
     [
-        (demo, lambda place: demo.run_demo(place, seed=1, say=print)),
+        (demo, lambda place: demo.run_demo(place, seed=1, begin_part=lambda *_, **__: None)),
         (reproduction, lambda place: reproduction.reproduce(place, size="quick")),
     ],
 )

@@ -78,12 +78,12 @@ def test_a_half_copied_log_is_superseded_as_soon_as_the_whole_one_is_there(tmp_p
 
 def test_a_young_log_waits_and_is_no_failure(tmp_path, night):
     log = tmp_path / "logs" / "other.mcap"
-    found, code = night(min_age_s=3600.0)
+    found, code = night(min_age=3600.0)
     assert (found["other.mcap"].status, code) == ("waiting", 0)
     assert not (tmp_path / "store").exists()
     os.utime(log, ns=(0, 10**18))
-    assert night(min_age_s=3600.0)[0]["other.mcap"].status == "done"
-    assert night(min_age_s=1e12)[0]["other.mcap"].status == "unchanged"  # what is there does not wait
+    assert night(min_age=3600.0)[0]["other.mcap"].status == "done"
+    assert night(min_age=1e12)[0]["other.mcap"].status == "unchanged"  # what is there does not wait
 
 
 def test_a_log_that_changes_while_it_is_looked_at_waits_also_where_it_cannot_be_read_yet(tmp_path, night, monkeypatch):
@@ -173,7 +173,7 @@ def test_damage_is_news_once_and_accepted_trouble_is_counted_apart(tmp_path, nig
 
 @pytest.mark.parametrize("broken", ["a digit", "half", "[]", "nothing", "gone"])
 def test_a_manifest_that_is_not_as_it_was_written_is_a_problem_and_its_log_is_ingested_again(tmp_path, night, broken):
-    run_id = night(tags={"weather": "dry"})[0]["other.mcap"].run.run_id
+    run_id = night(tag={"weather": "dry"})[0]["other.mcap"].run.run_id
     store = Store(tmp_path / "store")
     (name,) = [name for (kind, _), name in store.scan().names.items() if kind == "runs"]
     path = store.root / name
@@ -181,29 +181,29 @@ def test_a_manifest_that_is_not_as_it_was_written_is_a_problem_and_its_log_is_in
     contents = {"a digit": whole.replace(b"1", b"2", 1), "half": whole[:40], "[]": b"[]", "nothing": b""}
     path.write_bytes(contents[broken]) if broken in contents else path.unlink()
     documents._DECODED.clear()  # as a later call would find it
-    found = ask_status(store.root, min_age_s=0.0)
+    found = ask_status(store.root, min_age=0.0)
     assert [of.code for of in found.problems] == ([] if broken == "gone" else ["document-damaged"])
     assert (found.exit_code, found.counts) == (0 if broken == "gone" else 3, {"pending": 1})
     (tmp_path / "logs" / "junk.mcap").write_bytes(JUNK)
     assert [night()[0]["other.mcap"].status for _ in range(2)] == ["done", "unchanged"]
     assert counted(tmp_path) == {run_id}
     assert [run.facts.tags for run in store.runs()] == [{"weather": "dry"}]
-    assert ask_status(store.root, min_age_s=0.0).problems == (), "a new manifest has taken its place"
+    assert ask_status(store.root, min_age=0.0).problems == (), "a new manifest has taken its place"
 
 
 def test_a_document_that_is_damaged_and_that_no_call_writes_again_is_acknowledged(tmp_path, night):
-    night(tags={"weather": "dry"})
+    night(tag={"weather": "dry"})
     store = Store(tmp_path / "store")
     (file,) = store.place.list("tags")
     (store.root / "tags" / file).write_bytes(b"")
     documents._DECODED.clear()  # as a later call would find it
     night()
-    found = ask_status(store.root, min_age_s=0.0)
+    found = ask_status(store.root, min_age=0.0)
     assert (found.exit_code, [of.subject.name for of in found.problems]) == (3, [f"tags/{file}"])
     assert [run.facts.tags for run in store.runs()] == [{}]
     acknowledge([f"tags/{file}"], store=store.root)
-    assert ask_status(store.root, min_age_s=0.0).exit_code == 0
-    night(tags={"weather": "wet"})
+    assert ask_status(store.root, min_age=0.0).exit_code == 0
+    night(tag={"weather": "wet"})
     assert [run.facts.tags for run in store.runs()] == [{"weather": "wet"}]
 
 
@@ -259,7 +259,7 @@ def test_after_a_kill_between_manifest_and_the_memory_of_the_log_nothing_is_fuse
 
 
 def test_runs_of_two_recipes_live_side_by_side_and_share_their_streams(tmp_path, night, monkeypatch):
-    night(tags={"soil": "dry"})
+    night(tag={"soil": "dry"})
     other = Recipe(label=LabelConfig(velocity="fused"))
     monkeypatch.setattr(ingestion, "_read", lambda *_: pytest.fail("the log is read again"))
     ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=other)

@@ -34,7 +34,7 @@ def made(tmp_path_factory):
     drive_at(here / "run.mcap")
     store, again = here / "store", {"store": here / "store", "recipe": Recipe()}
     ingest([here / "run.mcap"], **again)
-    ingest([here / "run.mcap"], tags={"weather": "dry"}, **again)
+    ingest([here / "run.mcap"], tag={"weather": "dry"}, **again)
     add_map("site", height=WORLD.write(here, 0.2)["height"], store=store)
     assert verify(store).problems == ()
     return here
@@ -64,7 +64,7 @@ def test_what_is_to_be_done_about_a_damaged_file_makes_the_store_whole(made, tmp
         path.unlink()
     if kind.startswith(("runs/", "tags/")) or kind.endswith(".parquet"):
         assert is_document or "ingest the log again with --force" in told
-        ingest([made / "run.mcap"], store=store, recipe=Recipe(), force=True, tags={"weather": "dry"})
+        ingest([made / "run.mcap"], store=store, recipe=Recipe(), force=True, tag={"weather": "dry"})
     elif "site" in kind or kind.startswith("maps/"):
         assert is_document or "add the map again with --force" in told
         add_map("site", height=made / "height.tif", store=store, force=True)

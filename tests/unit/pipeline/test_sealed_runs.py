@@ -145,7 +145,7 @@ def test_a_run_that_another_has_taken_the_place_of_is_not_gone(store):
 def test_what_a_user_leaves_out_by_choice_is_no_problem(store):
     tag_run(store, "d", {"weather": "wet"})
     build(store)
-    assert build(store, tags={"weather": "wet"}, force=True).exit_code == 0
+    assert build(store, tag={"weather": "wet"}, force=True).exit_code == 0
     add_run(store, "e", segments("e", *lanes(14.0, -10.0, 10.0), robot="warthog"))
     under_another_recipe(store, "c")
     assert build(store, robot="warthog", force=True).exit_code == 0

@@ -58,7 +58,7 @@ def store(tmp_path_factory):
 
 
 def build(store, out, names, **keywords):
-    return build_dataset(out, store=store.root, map_name=names, recipe=Recipe(), **keywords)
+    return build_dataset(out, store=store.root, map=names, recipe=Recipe(), **keywords)
 
 
 @pytest.mark.parametrize("order", [("west", "east"), ("east", "west")])

@@ -40,7 +40,7 @@ def make_old(world):
     """Make a store in which each command has something to do: a superseded run, an old recipe, a replaced map, what a kill left."""
     if type(world.root) not in _OLD:
         world.run(lambda: world.ingest("long.mcap", "other.mcap", recipe=OLD))
-        world.run(lambda: world.ingest("short.mcap", "long.mcap", "junk.mcap", tags={"load": "12"}))
+        world.run(lambda: world.ingest("short.mcap", "long.mcap", "junk.mcap", tag={"load": "12"}))
         world.run(lambda: world.build("/first"))
         world.run(lambda: world.ingest("other.mcap"))
         for text in ("first", "second"):
@@ -51,9 +51,9 @@ def make_old(world):
 
 
 CALLS = {
-    "ingest": lambda world: world.ingest("short.mcap", "junk.mcap", tags={"load": "12"}),
+    "ingest": lambda world: world.ingest("short.mcap", "junk.mcap", tag={"load": "12"}),
     "ingest a longer log": lambda world: world.ingest("long.mcap"),
-    "ingest again": lambda world: world.ingest("long.mcap", tags={"surface": "wet"}, force=True),
+    "ingest again": lambda world: world.ingest("long.mcap", tag={"surface": "wet"}, force=True),
     "ingest under another recipe": lambda world: world.ingest("short.mcap", "long.mcap", recipe=OLD),
     "fail": lambda world: world.ingest("junk.mcap"),
     "add-map": lambda world: world.add_map("third"),

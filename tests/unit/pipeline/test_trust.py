@@ -38,7 +38,7 @@ def made(tmp_path_factory):
     store = small_store(directory)
     region = region_file(directory / "region.geojson", box(-20, -20, 5, 20))
     for name in ("zarr", "parquet"):
-        build_dataset(directory / name, store=store.root, split=region, recipe=Recipe(), file_format=name)
+        build_dataset(directory / name, store=store.root, split=region, recipe=Recipe(), format=name)
     return directory
 
 
@@ -356,7 +356,7 @@ def test_a_shard_of_another_build_is_refused_though_its_own_checksums_agree(copy
     """A folder that was copied in part over an older build trained a model without a word."""
     region = region_file(tmp_path / "region.geojson", box(-20, -20, 5, 20))
     other = replace(Recipe(), split=replace(Recipe().split, seed=7), sample=replace(Recipe().sample, patch_m=4.5))
-    build_dataset(tmp_path / "other", store=made / "store", split=region, recipe=other, file_format=name)
+    build_dataset(tmp_path / "other", store=made / "store", split=region, recipe=other, format=name)
     half = copy(name)
     shard = "patches.zarr/height/c/0/0/0" if name == "zarr" else "data/train-00000-of-00001.parquet"
     shutil.copyfile(tmp_path / "other" / shard, half / shard)

@@ -59,6 +59,6 @@ def test_what_differs_is_refused_and_what_settles_it_does(store, tmp_path):
         "a, c: gnss /fix (sensor_msgs/msg/NavSatFix, frame gps), imu /imu/data (sensor_msgs/msg/Imu, frame imu_link)",
         "b: imu /imu/data (sensor_msgs/msg/Imu, frame base_imu)",
     ]
-    build_dataset(tmp_path / "one", store=store.root, tags={"robot": "other"})
+    build_dataset(tmp_path / "one", store=store.root, tag={"robot": "other"})
     build_dataset(tmp_path / "all", store=store.root, robot="generic")
     assert [len(open_dataset(tmp_path / name).card.runs) for name in ("one", "all")] == [1, 3]

@@ -79,12 +79,12 @@ def _request(source, **options) -> PlanPathOptions:
 
 def test_a_plan_is_written_with_its_messages_and_replaced_by_another(source, tmp_path):
     out = tmp_path / "plan.geojson"
-    first = plan(MODEL, source, _request(source, objective="distance", cell_size_m=2.0, out=out))
+    first = plan(MODEL, source, _request(source, objective="distance", cell_size=2.0, out=out))
     assert len(read_line(out)) == 2
     assert first.lonlat_deg == pytest.approx(read_line(out))
     assert (first.nav2_path, first.nav2_waypoints) == (tmp_path / "plan.path.json", tmp_path / "plan.waypoints.json")
     assert str(first).splitlines()[-3:] == [str(path) for path in (out, first.nav2_path, first.nav2_waypoints)]
-    plan(MODEL, source, _request(source, objective="time", cell_size_m=2.0, out=out))
+    plan(MODEL, source, _request(source, objective="time", cell_size=2.0, out=out))
     found = json.loads(out.read_text())["features"][0]["properties"]
     assert found["objective"] == "time"
     assert found["complete"]
@@ -127,7 +127,7 @@ def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(sour
     costs = tmp_path / "costs"
     make_cost_map(MODEL, source, costs, cell_size_m=2.0)
     plans = [
-        plan(MODEL, source, _request(source, cell_size_m=2.0, cost_map=given, out=tmp_path / name))
+        plan(MODEL, source, _request(source, cell_size=2.0, cost_map=given, out=tmp_path / name))
         for name, given in (("with.geojson", costs), ("without.geojson", None))
     ]
     ours, theirs = plans
@@ -152,7 +152,7 @@ def test_a_cost_map_of_other_cells_gives_another_plan_and_a_damaged_one_is_refus
 def test_files_of_the_user_are_left_alone(source, path):
     before = path.read_bytes()
     with pytest.raises(UsageError, match="is no plan; it is not changed"):
-        plan(MODEL, source, _request(source, cell_size_m=2.0, out=path))
+        plan(MODEL, source, _request(source, cell_size=2.0, out=path))
     with pytest.raises(UsageError, match="is the file of the path"):
         predict_path(MODEL, source, path, path)
     assert path.read_bytes() == before

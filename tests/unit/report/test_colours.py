@@ -1,11 +1,13 @@
 """Colours that stand for something differ for every reader: simulated by the matrices of Machado, Oliveira and Fernandes (2009)."""
 
+import colorsys
 import itertools
 
 import numpy as np
 import pytest
 
-from tcpipe.report.colours import CLASS_COLOURS, DROPPED, KEPT, SEVERITY_COLOURS, SPLIT_COLOURS
+from tcpipe.report.colours import CLASS_COLOURS, DROPPED, KEPT, SEVERITY_COLOURS, SPLIT_COLOURS, choose_class_colours
+from tcpipe.terrain.layers import PAPER_CLASSES, TerrainClass
 
 SEEN = {
     "trichromat": np.eye(3),
@@ -43,3 +45,24 @@ def lab(rgb):
 def test_colours_differ_for_every_reader(eyes, colours, least):
     seen = [lab(SEEN[eyes] @ linear(colour)) for colour in colours]
     assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(seen, 2)) > least
+
+
+def hue_of(colour):
+    return colorsys.rgb_to_hsv(*linear(colour))[0] * 360
+
+
+def test_ground_has_the_colour_of_its_name_of_the_table_or_of_its_number():
+    names = ("wet grass", "Mud", "water", "gravel", "asphalt", "unpaved road", "class 7", "dry grass")
+    classes = [TerrainClass(number, name, traversable=True) for number, name in enumerate(names, 1)]
+    grass, mud, water, gravel, asphalt, track, unnamed, other_grass = choose_class_colours(classes).values()
+    assert 80 < hue_of(grass) < 150
+    assert 10 < hue_of(mud) < 40
+    assert 200 < hue_of(water) < 250
+    assert len(set(linear(gravel))) == 1
+    assert max(linear(asphalt)) < 0.15 < min(linear(gravel))
+    assert track != asphalt
+    assert unnamed == CLASS_COLOURS[6]
+    assert other_grass not in {grass, mud, water, gravel, asphalt, track}
+    given = TerrainClass(1, "grass", traversable=True, color="#123456")
+    assert choose_class_colours([given]) == {1: "#123456"}
+    assert len(set(choose_class_colours(PAPER_CLASSES.classes).values())) == 7

@@ -4,7 +4,6 @@ import base64
 import io
 import re
 import shutil
-from html import unescape
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -17,7 +16,6 @@ from synthetic_store import add_run, lanes, open_world, segments
 from tcpipe.dataset import open_dataset
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.report import report
-from tcpipe.pipeline.verify import verify
 from tcpipe.report import dataset_report
 from tcpipe.report.dataset_report import SAMPLE_COLUMNS, find_nearest_train_m, render_dataset_report, select_samples
 from tcpipe.report.label_sections import QUALITY_WORDS
@@ -95,34 +93,6 @@ def test_patches_are_those_of_the_samples_named(built, page):
 
 def picture(data):
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-
-
-def patch_of(sheet, number, sheets):
-    px, across = sheets["px"], sheets["across"]
-    return sheet[number // across * px :, number % across * px :][:px, :px]
-
-
-def test_pictures_of_all_patches_stand_beside_the_page_once_asked_for(built, tmp_path):
-    there = tmp_path / "dataset"
-    shutil.copytree(built, there)
-    assert "img-src data: blob:;" in render_dataset_report(there)
-    assert report(there, patches=True)[0].changed
-    html = (there / "report.html").read_text()
-    data, sheets = data_of(html), data_of(html)["patches"]
-    assert "img-src 'self' file: data: blob:;" in unescape(html)
-    for number, layer in enumerate(sheets["layers"]):
-        inside = picture(base64.b64decode(layer["uri"].split(",")[1]))
-        files = sorted((there / data["folder"]).glob(f"{number}-*.webp"))
-        assert len(files) == -(-data["count"] // data["per_sheet"])
-        for place, row in enumerate(sheets["rows"]):
-            file = there / data["folder"] / f"{number}-{row // data['per_sheet']}.webp"
-            beside = patch_of(picture(file.read_bytes()), row % data["per_sheet"], sheets).astype(float)
-            same = patch_of(inside, place, sheets).astype(float)
-            assert np.abs(beside - same).mean() < (0.01 if layer["name"] == "terrain" else 12.0), (layer["name"], row)
-    assert verify(there).problems == ()
-    assert not report(there)[0].changed  # it is used as long as it is there
-    shutil.rmtree(there / data["folder"])
-    assert report(there)[0].changed
 
 
 def test_runs_lead_to_their_pages_in_the_store_beside(built, page):

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 
 from tcpipe.formats.finding_lines import group_findings
 from tcpipe.report.page import Link, Number, Section, Shaded, render_page, show_verdict
-from tcpipe.report.plots import draw_ratios, draw_waterfall, make_plot, render_plots
+from tcpipe.report.plots import draw_waterfall, make_plot, render_plots
 from tcpipe.tables.findings import Remedy, Subject, judge, make_finding, read_catalogue
 
 EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e$$x$$ \\(y\\) \"'&"
@@ -93,7 +93,7 @@ def test_the_verdict_has_grades_then_reasons_the_worst_first_then_folded_notes()
     others = [replace(slow, code=code, remedies=()) for code in read_catalogue() if code.startswith("power-")][:8]
     findings = [note, slow, *others, replace(slow, numbers={**slow.numbers, "top_mps": 0.2}), empty]
     html = render_page(title="t", lead="", numbers=[], sections=[], verdict=show_verdict(judge(findings), findings))
-    box = html.split('<section class="verdict"')[1].split("</section>")[0]
+    box = "".join(html.split('<section class="verdict')[1:3]).rsplit("</section>", 1)[0]
     assert re.findall('<span class="([a-z-]+)">([a-z]+)', box) == [
         ("not-usable", name) for name in ("position", "time", "energy")
     ]
@@ -185,7 +185,7 @@ def test_what_waits_joins_what_is_drawn_first_and_names_the_axis_that_it_shares(
 
 def test_the_same_page_is_the_same_bytes_whatever_was_drawn_before():
     first = page()
-    draw_ratios("other", "x", [("y", (1.0, 0.9, 1.2))])
+    draw_waterfall({"kept": 1.0})
     assert page() == first
 
 
@@ -195,17 +195,6 @@ def test_nothing_is_asked_of_the_network_and_bokeh_comes_with_figures_alone():
     assert not [attrs for _, attrs in Seen(html).tags if {"src", "srcset", "data", "action"} & set(attrs)]
     html = render_page(title="t", lead="", numbers=[], warnings=[], sections=[Section("s", "text")])
     assert len(html) < 24_000
-
-
-def test_ratios_are_coloured_by_the_side_on_which_their_whole_interval_lies():
-    rows = [("better", (0.8, 0.7, 0.9)), ("unknown", (None, None, None)), ("open", (0.9, 0.7, 1.1)), ("worse", (1.5, 1.2, 2.0)),
-            ("few", (0.5, None, None))]  # fmt: skip
-    plot = draw_ratios("ratios", "RMSE", rows)
-    data = plot.figure.hover[0].renderers[0].data_source.data
-    assert data["name"] == ["better", "open", "worse", "few"]
-    colours = plot.legend
-    assert data["colour"] == [colours[side] for side in ("below 1", "not significant", "above 1", "not significant")]
-    assert (data["low"][3], data["high"][3]) == (0.5, 0.5)
 
 
 def test_the_waterfall_ends_at_what_is_kept():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from page_reading import data_of
 from stored_files import flip, manifest
-from synthetic_store import add_run, lanes, open_world, segments, supersede, tag_run
+from synthetic_store import add_run, driven, lanes, open_world, segments, supersede, tag_run
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats import documents
@@ -101,7 +101,7 @@ def test_each_run_is_there_as_its_documents_say(store):
 
 def test_the_verdict_is_that_of_the_current_runs_with_findings_by_code(store):
     html = shown(store)[1]
-    box = html.split('<section class="verdict"')[1].split("</section>")[0]
+    box = "".join(html.split('<section class="verdict')[1:3]).rsplit("</section>", 1)[0]
     assert '<span class="usable">position <b>usable</b></span>' in box
     assert '<span class="usable-with-care">time <b>usable with care</b></span>' in box
     assert "Most of the drive was commanded below" in box
@@ -226,3 +226,20 @@ def test_many_runs_are_all_told_and_some_can_be_read_without_scripts(store, monk
     assert len(rows) == 5
     assert "Without scripts the table shows the first 2 of 5." in html
     assert html.split("<h2>All runs</h2>")[1].split("</section>")[0].count("<tr>") == 3
+
+
+def test_the_page_of_few_runs_begins_with_their_tracks_and_the_table(tmp_path, monkeypatch):
+    store = open_world(tmp_path)
+    for number, run_id in enumerate(("a", "b")):
+        table = segments(run_id, *lanes(np.array([float(number)]), -10.0, 10.0), start_ns=10**18 + number * 10**14)
+        add_run(store, run_id, table, track=driven(table), energy_joule=36_000.0, distance_by_reason_m={"kept": 500.0})
+    _, html, _, rows = shown(store)
+    titles = [part.partition("</h2>")[0] for part in html.split("<h2>")[1:]]
+    assert titles[:2] == ["Tracks", "All runs"]
+    assert [(row["energy"], row["wh_per_km"]) for row in rows] == [(10.0, 20.0)] * 2
+    assert "<td>10.0</td>" in html.replace(' class="number"', "")
+    monkeypatch.setattr(report_module, "_FEW_RUNS", 2)
+    html = shown(store)[1]
+    assert "<h2>Tracks</h2>" not in html
+    (run, _) = store.runs()
+    assert ">20.0 Wh/km<" in run.facts._repr_html_()

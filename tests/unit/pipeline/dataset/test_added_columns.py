@@ -53,7 +53,7 @@ def missing(result):
 
 @pytest.mark.parametrize("file_format", ["zarr", "parquet"])
 def test_tags_and_covariates_are_columns_of_the_samples(store, tmp_path, file_format):
-    result = build(store, tmp_path / "out", covariates=weather(tmp_path / "weather.csv"), file_format=file_format)
+    result = build(store, tmp_path / "out", covariates=weather(tmp_path / "weather.csv"), format=file_format)
     rows = read_samples(tmp_path / "out").to_pylist()
     assert len(rows) == result.card.samples == 80
     for row in rows:

@@ -97,7 +97,7 @@ def test_what_is_missing_is_named(store, tmp_path):
     bare = open_store(tmp_path / "bare", create=True)
     bare.put(State(), "calls", "0000000100000000", Call(command="ingest", version="2.0.0"))
     with pytest.raises(DatasetError) as caught:
-        build(bare, tmp_path, map_name="site")
+        build(bare, tmp_path, map="site")
     runs, maps = caught.value.problems
     assert "no runs in the store" in runs
     assert "no map 'site' in the store" in maps
@@ -109,8 +109,8 @@ def test_several_maps_are_listed_with_the_flag(store, tmp_path):
     line = refused(store, tmp_path)
     assert "(site, yard)" in line
     assert "--map" in line
-    assert "no map 'field'" in refused(store, tmp_path, map_name="field")
-    assert build(store, tmp_path, map_name="yard").card.samples == 20
+    assert "no map 'field'" in refused(store, tmp_path, map="field")
+    assert build(store, tmp_path, map="yard").card.samples == 20
 
 
 def test_two_robots_are_not_pooled_unasked(store, tmp_path):

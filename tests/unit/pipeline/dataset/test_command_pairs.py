@@ -40,7 +40,6 @@ def explain_one(here):
 COMMANDS = {
     "build": build,
     "report": lambda here: report(here / "dataset"),
-    "report with patches": lambda here: report(here / "dataset", patches=True),
     "report of the store": lambda here: report(here / "store"),
     "verify": lambda here: verify(here / "dataset"),
     "diff": lambda here: diff(here / "dataset", here / "dataset"),

@@ -33,7 +33,7 @@ def made(tmp_path_factory):
     directory = tmp_path_factory.mktemp("made")
     store = small_store(directory)
     for kind in ("zarr", "parquet"):
-        build_dataset(directory / kind, store=store.root, recipe=Recipe(), file_format=kind)
+        build_dataset(directory / kind, store=store.root, recipe=Recipe(), format=kind)
     return directory
 
 

@@ -78,7 +78,7 @@ def write_height(path, change=None):
 
 def build(directory, store, change=None, name="site"):
     put_map(store, name, height=write_height(directory / f"{name}.tif", change))
-    return build_dataset(directory / name, store=store.root, map_name=name)
+    return build_dataset(directory / name, store=store.root, map=name)
 
 
 def read_samples(directory):

@@ -41,7 +41,7 @@ def made(tmp_path_factory):
 
 
 def usual(here: Path, **how: object) -> dict[str, object]:
-    first = {"store": here / "store", "map_name": "site", "split": here / "region.geojson", "tags": {"weather": "dry"}}
+    first = {"store": here / "store", "map": "site", "split": here / "region.geojson", "tag": {"weather": "dry"}}
     return first | {"recipe": Recipe()} | how
 
 
@@ -65,9 +65,9 @@ def refused(here: Path, **how: object) -> tuple[str, ...]:
 
 
 OTHER = {
-    "map_name": ("yard", "--map: site in the dataset, yard now"),
-    "tags": ({}, "--tag: weather=dry in the dataset, none now"),
-    "file_format": ("parquet", "--format: zarr in the dataset, parquet now"),
+    "map": ("yard", "--map: site in the dataset, yard now"),
+    "tag": ({}, "--tag: weather=dry in the dataset, none now"),
+    "format": ("parquet", "--format: zarr in the dataset, parquet now"),
     "seed": (5, "recipe split.seed: 0 in the dataset, 5 now"),
     "holdout": ("sample", "recipe split.holdout: block in the dataset, sample now"),
     "without_coordinates": (True, "--without-coordinates: no in the dataset, yes now"),
@@ -95,7 +95,7 @@ def test_regions_and_tables_differ_by_what_they_are(here):
         assert line.startswith("--split: train_test (")
         assert now in line
     assert refused(here, covariates=here / "soil.csv") == ("--covariates: none in the dataset, soil.csv now",)
-    assert len(refused(here, split=None, seed=3, map_name=["site", "yard"])) == 3
+    assert len(refused(here, split=None, seed=3, map=["site", "yard"])) == 3
 
 
 def test_the_same_region_written_otherwise_is_the_same_option(here):
@@ -111,7 +111,7 @@ OWN_FILES = ("notes.txt", "figures/a.svg")
 def test_files_of_others_are_named_and_kept(here):
     """A file manager or a GIS leaves files in any folder that somebody looks at."""
     out = here / "dataset"
-    report(out, patches=True)
+    report(out)
     (out / "figures").mkdir()
     names = sorted((*DESKTOP_FILES, *OWN_FILES))
     for name in names:
@@ -144,10 +144,10 @@ def test_a_file_of_others_that_the_new_dataset_would_replace_is_kept(here):
 CAUSES = {
     "covariates": ({"covariates": "soil.csv"}, {}, ("covariates: removed soil.csv",)),
     "content of covariates": ({"covariates": "soil.csv"}, {"covariates": "wet/soil.csv"}, ("covariates: soil.csv is another one",)),
-    "chosen tags": ({"tags": {"weather": "dry"}}, {"tags": {}},
+    "chosen tags": ({"tag": {"weather": "dry"}}, {"tag": {}},
     ("run: added wet", "chosen tags: weather dry → none")),
-    "order of maps": ({"map_name": ["site", "yard"]}, {"map_name": ["yard", "site"]}, ("order of maps: site, yard → yard, site",)),
-    "map": ({"map_name": "site"}, {"map_name": "yard"}, ("map: added yard", "map: removed site", "order of maps: site → yard")),
+    "order of maps": ({"map": ["site", "yard"]}, {"map": ["yard", "site"]}, ("order of maps: site, yard → yard, site",)),
+    "map": ({"map": "site"}, {"map": "yard"}, ("map: added yard", "map: removed site", "order of maps: site → yard")),
     "region": ({"split": "region.geojson"}, {"split": "other.geojson"}, ("region: train_test is another one",)),
 }  # fmt: skip
 
@@ -169,7 +169,7 @@ def test_diff_names_every_input_that_differs(here, name):
 
 def test_the_record_of_inputs_is_read_as_it_was_written(here):
     """Its digest decides whether a dataset is built again."""
-    build_dataset(here / "b", **usual(here, covariates=here / "soil.csv", map_name=["yard", "site"]))
+    build_dataset(here / "b", **usual(here, covariates=here / "soil.csv", map=["yard", "site"]))
     for name in ("b", "dataset"):
         card = read_card(here / name)
         assert card.made_from.digest == card.inputs
@@ -228,7 +228,7 @@ def test_a_dataset_without_coordinates_does_not_store_its_options(here):
     build_dataset(out, **usual(here, without_coordinates=True, force=True))
     assert read_card(out).made_from.tags == {}
     assert build_dataset(out, **usual(here, without_coordinates=True)).status == "unchanged"
-    (line,) = refused(here, without_coordinates=True, map_name="yard")
+    (line,) = refused(here, without_coordinates=True, map="yard")
     assert line == "--without-coordinates: maps, region, tags and recipe are not stored and cannot be compared"
     assert refused(here) == ("--without-coordinates: yes in the dataset, no now",)
 
@@ -253,13 +253,13 @@ def test_in_a_bucket_the_differences_are_named_too_and_force_builds_beside_it(he
     with object_store(here / "served") as (environment, _):
         in_environment(monkeypatch, environment, here / "cache")
         with pytest.raises(UsageError) as caught:
-            build_dataset("s3://sets/ds", **usual(here, map_name="yard"))
+            build_dataset("s3://sets/ds", **usual(here, map="yard"))
         assert "was made with other options and is not changed" in caught.value.problems[0]
-        assert caught.value.problems[1:] == (f"s3://sets/ds: {OTHER['map_name'][1]}",)
+        assert caught.value.problems[1:] == (f"s3://sets/ds: {OTHER['map'][1]}",)
         assert build_dataset("s3://sets/ds", **usual(here)).status == "unchanged"
         assert tree(here / "served" / "sets" / "ds") == tree(here / "dataset")
-        assert build_dataset("s3://sets/ds", **usual(here, map_name="yard", force=True)).status == "done"
-        build_dataset(here / "dataset", **usual(here, map_name="yard", force=True))
+        assert build_dataset("s3://sets/ds", **usual(here, map="yard", force=True)).status == "done"
+        build_dataset(here / "dataset", **usual(here, map="yard", force=True))
         (build,) = (here / "served" / "sets" / "ds" / "builds").iterdir()
         assert read_card(build) == read_card(here / "dataset")
 
@@ -269,7 +269,7 @@ def test_what_another_call_builds_there_meanwhile_stays(here, monkeypatch):
 
     def while_the_first_draws(*how, **more):
         monkeypatch.setattr(writing, "write_patches", draw)
-        build_dataset(out, **usual(here, map_name="yard", force=True))
+        build_dataset(out, **usual(here, map="yard", force=True))
         return draw(*how, **more)
 
     add_run(open_store(here / "store"), "dry", segments("dry", *lanes(1.0, -10.0, 10.0)))
@@ -293,4 +293,4 @@ def test_the_command_says_each_difference_and_ends_with_2(here, monkeypatch):
 def test_the_options_are_compared_as_data_and_not_by_how_they_are_written(here):
     same = replace(Recipe(), sample=SampleConfig(patch_px=40))
     assert build_dataset(here / "dataset", **usual(here, recipe=same, robot="husky")).status == "unchanged"
-    assert build_dataset(here / "dataset", **usual(here, tags={"weather": "dry"}, min_runs=1)).status == "unchanged"
+    assert build_dataset(here / "dataset", **usual(here, tag={"weather": "dry"}, min_runs=1)).status == "unchanged"

@@ -79,7 +79,7 @@ def built(tmp_path_factory):
     how = {
         "store": here / "store",
         "split": region_file(here / "region.geojson", box(-18, -18, 18, 0)),
-        "file_format": "parquet",
+        "format": "parquet",
         "covariates": here / "secretstation.csv",
     }
     return here, build_dataset(here / "full", **how), build_dataset(here / "public", without_coordinates=True, **how)
@@ -279,7 +279,7 @@ def test_no_field_of_a_finding_passes_unless_the_catalogue_calls_it_public(kind)
 def test_the_bytes_do_not_depend_on_jobs_or_on_the_name_of_the_directory(built, tmp_path):
     here, *_ = built
     how = {"store": here / "store", "split": here / "region.geojson", "covariates": here / "secretstation.csv"}
-    build_dataset(tmp_path / "again", **how, file_format="parquet", without_coordinates=True, jobs=2)
+    build_dataset(tmp_path / "again", **how, format="parquet", without_coordinates=True, jobs=2)
     assert read_files(tmp_path / "again") == read_files(here / "public")
 
 
@@ -311,6 +311,6 @@ def test_the_line_that_publishes_it_is_printed_and_a_second_build_has_nothing_to
     here, full, public = built
     assert f"publish it with: hf upload OWNER/NAME {here}/public . --repo-type dataset" in str(public)
     assert "hf upload" not in str(full)
-    how = {"store": here / "store", "split": here / "region.geojson", "file_format": "parquet"}
+    how = {"store": here / "store", "split": here / "region.geojson", "format": "parquet"}
     how["covariates"] = here / "secretstation.csv"
     assert build_dataset(here / "public", without_coordinates=True, **how).status == "unchanged"
