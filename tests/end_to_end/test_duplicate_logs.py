@@ -12,6 +12,7 @@ from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.pipeline.dataset.inputs import remove_duplicates
 from tcpipe.pipeline.dataset.runs import choose_runs
 from tcpipe.pipeline.ingest import ingest
+from tcpipe.simulation.route import Wander
 from tcpipe.store import Store
 
 
@@ -35,7 +36,7 @@ def move_east(columns):
 
 @pytest.fixture(scope="module")
 def drive():
-    return make()
+    return make(Wander(35.0, (110.0, 30.0)))
 
 
 def test_one_drive_in_an_mcap_and_a_trimmed_bag_counts_once(drive, tmp_path):

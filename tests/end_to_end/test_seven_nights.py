@@ -13,14 +13,15 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import pytest
-from installed_command import COMMAND, HANGS_S
+from installed_command import COMMAND, HANGS_S, tcpipe
 
-import tcpipe
+import tcpipe as package
 from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation import Faults, make_tiny, messages, simulate
 
@@ -98,6 +99,24 @@ def full_disk(data: Path) -> Iterator[str]:
     filler.unlink()
 
 
+@contextmanager
+def advance_clock(ahead_s: int) -> Iterator[None]:
+    """Show tcpipe in this process a clock that is ahead, as `CLOCK` does in others."""
+    real_ns = time.time_ns
+
+    class Later(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> "Later":
+            return cls.fromtimestamp(real_ns() / 1e9 + ahead_s, tz)
+
+    with (
+        patch("time.time_ns", lambda: real_ns() + ahead_s * 10**9),
+        patch("time.time", lambda: real_ns() / 1e9 + ahead_s),
+        patch("tcpipe.pipeline.calls.datetime", Later),
+    ):
+        yield
+
+
 class Crontab:
     """The job of `pipelines/crontab` on another directory, night after night."""
 
@@ -119,7 +138,7 @@ class Crontab:
             **{name: value.replace("/data", str(data)) for name, value in given.items()},
             "HOME": str(tmp_path),
             "PATH": f"{self._bin}:{COMMAND.parent}:/usr/bin:/bin",
-            "PYTHONPATH": f"{tmp_path / 'clock'}:{Path(tcpipe.__file__).parents[1]}",
+            "PYTHONPATH": f"{tmp_path / 'clock'}:{Path(package.__file__).parents[1]}",
         }
         self._night = 0
 
@@ -149,11 +168,10 @@ class Crontab:
         return mail, job.returncode
 
     def run_by_hand(self, *arguments: str, exit_code: int = 0) -> str:
-        """Run a command as the user does in the morning, who works in the directory; return what it printed on stdout."""
-        environment = self._environment | {"CLOCK_AHEAD_S": str(self._night * _DAY_S + _DAY_S // 4)}
-        done = subprocess.run(
-            [COMMAND, *arguments], cwd=self.data, env=environment, capture_output=True, text=True, check=False
-        )
+        """Run a command as the user does in the morning, in this process; return what it printed on stdout."""
+        environment = {name: value for name, value in self._environment.items() if name != "PYTHONPATH"}
+        with advance_clock(self._night * _DAY_S + _DAY_S // 4):
+            done = tcpipe(*arguments, cwd=self.data, env=environment)
         assert done.returncode == exit_code, done.stderr
         return done.stdout
 
