@@ -143,11 +143,10 @@ def test_heights_in_feet_are_told_from_heights_in_metres():
 @pytest.mark.parametrize(
     ("per_metre", "unit"), [(10.0, "dm"), (100.0, "cm"), (1000.0, "mm"), (0.1, "m"), (0.3048, "m"), (2.5, "")]
 )
-@pytest.mark.parametrize("std_m", [0.02, 0.08])
-def test_any_unit_of_heights_is_found_and_a_metre_is_none(per_metre, unit, std_m):
+def test_any_unit_of_heights_is_found_and_a_metre_is_none(per_metre, unit):
     """GNSS heights that drift leave the scale of metres uncertain, but not that of another unit."""
     xy = drive()
-    height = 600.0 + rolling(*np.add(xy, (0.6, -0.4)).T) + drift(len(xy), std_m, 100, 2)
+    height = 600.0 + rolling(*np.add(xy, (0.6, -0.4)).T) + drift(len(xy), 0.08, 100, 2)
     other = register_track(site(lambda x, y: per_metre * rolling(x, y), noise_m=0.01 * per_metre), xy, height).scale
     assert (other.is_wrong(), other.find_unit()) == (True, unit)
     assert not register_track(site(), xy, height).scale.is_wrong()
@@ -221,7 +220,7 @@ def test_a_shift_is_inside_two_sigma_on_tilted_and_noisy_maps(shift_m, tilt):
     assert [of.height_offset_m for of in found] == pytest.approx([46.2] * 8, abs=0.2)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_tilt_alone_is_no_shift(seed):
     """On a hill without other relief a tilt is a shift, and on even ground everything is."""
     for ground in (lambda x, y: 0.002 * (x**2 + y**2), lambda x, y: 0.0 * x * y, lambda x, y: 0.1 * x - 0.03 * y):
