@@ -12,29 +12,10 @@ from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe, told
 from mcap.writer import Writer
 from storage_server import FORBIDDEN, object_store
 from stored_files import only_run
-from wheel_drives import drive_at
+from wheel_drives import START_NS, drive_at, wheel_drive
 
-from tcpipe.formats.logs.writing import MessageStream, write_mcap, write_rosbag2
+from tcpipe.formats.logs.writing import write_mcap, write_rosbag2
 from tcpipe.store import Store
-from tcpipe.tables.findings import select_findings
-
-ODOMETRY = "nav_msgs/msg/Odometry"
-START_NS = 1_700_000_000_000_000_000
-
-
-def drive(*, simulated: bool = False) -> list[MessageStream]:
-    """Half a minute straight ahead, by the wheels alone."""
-    log_ns = START_NS + np.arange(1500) * 20_000_000
-    header_ns = log_ns - START_NS + 5 * 10**9 if simulated else log_ns
-    columns = {
-        "header.stamp.sec": (header_ns // 10**9).astype(np.int32),
-        "header.stamp.nanosec": (header_ns % 10**9).astype(np.uint32),
-        "pose.pose.position.x": np.arange(1500) * 0.02,
-        "pose.pose.orientation.w": np.ones(1500),
-        "twist.twist.linear.x": np.ones(1500),
-    }
-    texts = {"header.frame_id": "odom", "child_frame_id": "base_link"}
-    return [MessageStream("/wheel/odom", ODOMETRY, log_ns, columns, texts)]
 
 
 @pytest.mark.parametrize(("content", "store"), [(b"nonsense", "tcpipe-store"), (b"#ROSBAG V2.0\n", "deep/down/store")])
@@ -49,15 +30,6 @@ def test_what_cannot_be_ingested_is_known_to_fail_from_then_on(tmp_path, content
     plain_lines(tcpipe("ingest", "a.bag", "--store", store, "--retry-failed", cwd=tmp_path), 1)
 
 
-def test_what_has_no_checksum_and_which_clock_is_simulated_is_said(tmp_path):
-    write_rosbag2(tmp_path / "run", drive(simulated=True), storage="sqlite3")
-    assert tcpipe("ingest", "run", cwd=tmp_path).returncode == 0
-    found = only_run(tmp_path / "tcpipe-store").manifest
-    assert found.damage == ()
-    assert [of.code for of in found.notes] == ["no-checksum"]
-    assert "simulated-time" in {of.code for of in found.findings}
-
-
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
 def test_why_a_log_of_another_encoding_is_refused_is_said(tmp_path, encoding):
     with (tmp_path / "run.mcap").open("wb") as file:
@@ -69,19 +41,6 @@ def test_why_a_log_of_another_encoding_is_refused_is_said(tmp_path, encoding):
         writer.finish()
     said = plain_lines(tcpipe("ingest", "run.mcap", cwd=tmp_path), 1)
     assert f"topics with data that cannot be decoded: /pose: its messages are encoded as {encoding}; cdr and" in said
-
-
-def test_what_plays_no_role_is_said_and_kept(tmp_path):
-    (stream,) = drive()
-    columns = {name: values[:20] for name, values in stream.columns.items()}
-    few = MessageStream("/odom", ODOMETRY, stream.log_time_ns[:20], columns, stream.constants)
-    write_mcap(tmp_path / "run.mcap", [stream, few])
-    tcpipe("ingest", "run.mcap", cwd=tmp_path)
-    report = only_run(tmp_path / "tcpipe-store").manifest.info.report
-    (left_out,) = select_findings(report.findings, "topic-left-out")
-    assert left_out.subject.name == "/odom"
-    assert left_out.names == {"role": "wheel_odometry", "reason": "covers-little"}
-    assert report.facts.left_out == {"/odom": "it covers little of what /wheel/odom covers (1500 messages over 30.0 s)"}
 
 
 def test_the_good_are_done_and_the_bad_are_named(tmp_path):
@@ -165,7 +124,7 @@ def test_each_log_is_told_as_it_ends(tmp_path):
 def test_shares_of_a_folder_and_parts_of_a_bag(tmp_path):
     for number in range(2):
         drive_at(tmp_path / "logs" / f"run{number}.mcap", seed=number)
-    write_rosbag2(tmp_path / "logs" / "bag", drive(), storage="sqlite3")
+    write_rosbag2(tmp_path / "logs" / "bag", wheel_drive(seed=5), storage="sqlite3")
     shutil.copy(tmp_path / "logs" / "run0.mcap", tmp_path / "logs" / "bag" / "bag_1.mcap")
     shares = [tcpipe("ingest", "logs", "--shard", f"{index}/2", "--json", cwd=tmp_path) for index in (1, 2)]
     assert [share.returncode for share in shares] == [0, 0]
@@ -181,7 +140,7 @@ def test_shares_of_a_folder_and_parts_of_a_bag(tmp_path):
 def test_logs_in_object_storage(tmp_path):
     bucket = tmp_path / "store" / "drives"
     bucket.mkdir(parents=True)
-    write_mcap(bucket / "run.mcap", drive())
+    write_mcap(bucket / "run.mcap", wheel_drive(seed=5))
     (bucket / "junk.bag").write_bytes(b"nonsense")
     (bucket / "notes.txt").write_text("none of a log")
     with object_store(tmp_path / "store") as (environment, fetched):
@@ -240,7 +199,7 @@ def test_definitions_that_cannot_be_used_are_refused(undefined, command, directo
 
 
 def test_export_says_what_it_did_and_that_nothing_is_left_to_do(tmp_path):
-    write_mcap(tmp_path / "run.mcap", drive())
+    write_mcap(tmp_path / "run.mcap", wheel_drive(seed=5))
     first = tcpipe("export", "run.mcap", "/wheel/odom", "out", cwd=tmp_path)
     assert (first.returncode, "1500 messages  /wheel/odom" in first.stdout) == (0, True)
     again = tcpipe("export", "run.mcap", "--topics", "/wheel/odom", "out", cwd=tmp_path)

@@ -52,14 +52,6 @@ def files(directory):
     return sorted(path for path in directory.rglob("*") if path.is_file())
 
 
-@pytest.mark.parametrize("name", ["zarr", "parquet"])
-def test_what_is_whole_verifies(made, name):
-    found = verify(made / name)
-    assert found.problems == ()
-    assert (found.kind, found.read["samples"]) == ("dataset", 448)
-    assert "no changes found" in str(found)
-
-
 def test_a_store_its_runs_and_its_map_verify(made):
     found = verify(made / "store")
     assert (found.problems, found.kind, found.read["runs"], found.read["maps"]) == ((), "store", 2, 1)
