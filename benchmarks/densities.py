@@ -23,7 +23,6 @@ from campaign_drives import HUSKY, WHOLE, MemoryLog, simulated
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel, SensorNoise, fit_noise
-from tcpipe.fusion.excursions import find_event_candidates
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.recipe import Recipe
@@ -184,9 +183,8 @@ def read(path: Path) -> None:
         start = time.process_time()
         residuals = find_residuals(measurements)
         model = fit_noise(measurements, residuals)
-        candidates = find_event_candidates(residuals, model)
         print(f"{path.name}: {', '.join(measurements.sensors())}; CPU {time.process_time() - start:.2f} s")
-        print(*describe(model), f"  {len(candidates)} candidates of events", sep="\n")
+        print(*describe(model), sep="\n")
 
 
 def main() -> None:

@@ -407,7 +407,7 @@ def _arm(name: str, messages: Callable[[Messages, Drive], Messages], said: str, 
     return Fault(name, ("gnss",), said=said, readings=_ordinary, messages=messages, route=route)
 
 
-_OF_NO_FAULT = r"stamp-jitter|lever-arm-\w+|sensor-not-placed|odometry-scale|velocity-scatters|measurements-rejected"
+_OF_NO_FAULT = r"stamp-jitter|lever-arm-\w+|sensor-not-placed|odometry-scale|measurements-rejected"
 _GNSS, _VISUAL, _WHEELS, _IMU = (
     rf"(?m)^{role}\b(?!.*\[({_OF_NO_FAULT})\])" for role in ("gnss", "visual_odometry", "wheel_odometry", "imu")
 )

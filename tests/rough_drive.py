@@ -131,7 +131,6 @@ def measured(truth, seed=0, *, gnss_std=0.015):
         ),
         variance_m2ps2=np.column_stack((np.full(at.size, 0.05**2), np.full((at.size, 2), np.nan))),
         yaw_rate_radps=truth.turn[at, 2] * 0.8,
-        yaw_rate_var=np.full(at.size, 0.1**2),
     )
     at = rows(25, 3)
     seen = truth.body_velocity[at] + np.cross(truth.turn[at], CAMERA_M)
@@ -140,7 +139,6 @@ def measured(truth, seed=0, *, gnss_std=0.015):
         velocity_mps=seen + rng.normal(0, 0.05, (at.size, 3)),
         variance_m2ps2=np.full((at.size, 3), 0.05**2),
         yaw_rate_radps=truth.turn[at, 2] + rng.normal(0, 0.02, at.size),
-        yaw_rate_var=np.full(at.size, 0.02**2),
         lever_arm_m=CAMERA_M,
     )
     at = rows(10, 7)

@@ -265,9 +265,8 @@ def make_noise_facts():
     """Return facts of a run of fixes and wheels, whose noise was fitted."""
     time_s = (0.1, 1.0, 10.0, 80.0)
     noise = {
-        "gnss": NoiseFacts("m", time_s, (0.02, 0.02, 0.03, 0.03), (0.02,) * 4, (0.9, 0.9, 0.8, 0.7)),
-        "wheel_odometry": NoiseFacts("m", time_s, (0.002, 0.02, 0.2, 1.0), (0.001, 0.003, 0.01, 0.03), (0.3, 0.4, 0.5, 0.6)),
-        "wheel_odometry turn": NoiseFacts("rad", time_s, (0.001, 0.003, 0.01, 0.1), (0.001, 0.003, 0.01, 0.03), (0.9,) * 4),
+        "gnss": NoiseFacts(time_s, (0.02, 0.02, 0.03, 0.03), (0.02,) * 4, (0.9, 0.9, 0.8, 0.7)),
+        "wheel_odometry": NoiseFacts(time_s, (0.002, 0.02, 0.2, 1.0), (0.001, 0.003, 0.01, 0.03), (0.3, 0.4, 0.5, 0.6)),
     }  # fmt: skip
     sections = (StretchFacts({}, {}, {}, end_ns=1), StretchFacts({}, {}, {}, noise=noise, end_ns=10**10))
     return StageFacts(fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, sections))

@@ -73,15 +73,6 @@ def compute_turns(quat_xyzw: Floats, rows: int = 1) -> Floats:
     return rotation_vector_from_quat(multiply(invert(quat_xyzw[:-rows]), quat_xyzw[rows:]))
 
 
-def add_turn_variance(fixes: Positions, time_std_s: Floats) -> Positions:
-    """Return positions with the variance of the attitude raised by how far the robot turns in a time (N,) [s]."""
-    if fixes.quat_xyzw is None or fixes.rotation_variance_rad2 is None:
-        return fixes
-    rate = np.nan_to_num(compute_turns(fixes.quat_xyzw) / (np.diff(fixes.stamp_ns) * 1e-9)[:, None])
-    largest = np.maximum(np.square(np.append(rate, rate[-1:], axis=0)), np.square(np.append(rate[:1], rate, axis=0)))
-    return replace(fixes, rotation_variance_rad2=fixes.rotation_variance_rad2 + largest * time_std_s[:, None] ** 2)
-
-
 def align_mounting(fixes: Positions, odometry: BodyVelocities | None, *, is_stated: bool) -> Positions:
     """Return positions with the attitude of a robot that drives along its x axis, as the odometry tells its sign.
 

@@ -10,15 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
+from tcpipe.fusion.densities import NoiseModel
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, Tests
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS
+from tcpipe.fusion.pair_residuals import ACROSS, ALONG, Residuals
 from tcpipe.fusion.parameters import FIX_AXES, Event
-from tcpipe.fusion.signals import SPIKE_RATIO, compute_moving_mean, compute_running_median
+from tcpipe.fusion.signals import SPIKE_RATIO, compute_running_median
 from tcpipe.fusion.ticks import Ticks
 from tcpipe.tables.findings import read_threshold
 
@@ -93,8 +96,6 @@ _STEP_COST = 12.0
 """Log of how unlikely a step of fixes is beforehand [nat]."""
 _STD_FACTOR = 3.0
 """Factor of the standard deviation of an estimated change [1]: the filter estimates it again from the same measurements."""
-_AROUND_STEP_S = 40.0
-"""How long before and after a step fixes may drift by as much [s]: corrections age, and ambiguities are resolved slowly."""
 _NOISE_S = 1.5
 """Correlation time of a larger noise of fixes [s]: reflected signals change as the antenna moves by a metre."""
 _SLOW_S = 60.0
@@ -105,10 +106,6 @@ _MIN_REJECTIONS = 5
 """Rejections in a row that are no single outliers [1]."""
 _MEDIAN_ROWS = 7
 """Measurements whose median one of them is compared with [1]."""
-_MAX_ACCELERATION_MPS2 = 3.0
-"""Acceleration of a ground robot that is no scatter of a sensor [m/s²]."""
-_SPAN_ROWS, _MIN_SPIKE_SHARE = 31, 0.2
-"""Measurements in a row [1], and share of spikes among them above which the sensor is useless [1]."""
 _SAME_EVENT_TICKS = 20
 """Ticks between two events of one block, below which they are one event [1]."""
 _MAX_REST = 0.4
@@ -154,18 +151,15 @@ class Change:
                         else Event(self.last, place, std, -mean)
                     )
 
-    def alter_ticks(self, ticks: Ticks, *, drifts: bool) -> Ticks:
-        """Return the ticks as they are under the change; if ``drifts``, fixes may also drift before and after a step."""
-        if self.kind not in {"noise", "wander"} and not (self.kind == "step" and drifts):
+    def alter_ticks(self, ticks: Ticks) -> Ticks:
+        """Return the ticks as they are under the change."""
+        if self.kind not in {"noise", "wander"}:
             return ticks
         inputs = ticks.inputs
         kept, noise, variance = inputs.fix_kept.copy(), inputs.fix_noise.copy(), ticks.fix_variance_m2.copy()
         first, last = self.first, kept.size if self.last is None else self.last
         if self.kind == "noise":
             kept[:] = np.exp(-inputs.period_s / _NOISE_S)
-        elif self.kind == "step":
-            around = round(_AROUND_STEP_S / inputs.period_s)
-            first, last = max(first - around, 0), min(first + around, kept.size)
         variance[first:last] = np.maximum(variance[first:last], np.square(self.size * FIX_AXES))
         if last < kept.size:
             kept[last] *= np.sqrt(variance[last, 0] / variance[last - 1, 0])
@@ -176,38 +170,29 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Set of changes with its score [nat], and the number of changes in a rejected set that explains clearly more."""
+    """Set of changes with its score [nat]."""
 
     changes: tuple[Change, ...]
     score: float = 0.0
-    rival_change_count: int = 0
 
     @property
     def events(self) -> tuple[Event, ...]:
         """Events in the state by all changes, in order of time."""
         return tuple(sorted((e for c in self.changes for e in c.list_events()), key=lambda event: event.tick))
 
-    def alter_ticks(self, ticks: Ticks, *, drifts: bool = False) -> Ticks:
-        """Return the ticks as they are under all changes; ``drifts`` is False while hypotheses are compared."""
+    def alter_ticks(self, ticks: Ticks) -> Ticks:
+        """Return the ticks as they are under all changes."""
         for change in self.changes:
-            ticks = change.alter_ticks(ticks, drifts=drifts)
+            ticks = change.alter_ticks(ticks)
         return ticks
-
-    @property
-    def ignored(self) -> tuple[tuple[int, int, int], ...]:
-        """Measurements that are not used: (kind, first tick, last tick)."""
-        return tuple(
-            (c.role, c.first, 1 << 60 if c.last is None else c.last) for c in self.changes if c.kind == "useless"
-        )
 
     def alter_priors(self, std: Floats, walk: Floats, time_s: Floats) -> None:
         """Alter standard deviation, walk and correlation time of every error, shapes (45,), to those under all changes."""
         offset = slice(state.FIX_OFFSET, state.FIX_OFFSET + 3)
         for change in self.changes:
-            if change.kind == "step":  # either side may be right: both are off by half of it, 1σ
-                std[offset] = np.maximum(std[offset], 0.5 * change.size * FIX_AXES)
-            elif change.kind == "slow":
-                std[offset] = np.maximum(std[offset], change.size * FIX_AXES)
+            if change.kind in {"step", "slow"}:  # either side of a step may be right: both are off by half of it, 1σ
+                share = 0.5 if change.kind == "step" else 1.0
+                std[offset] = np.maximum(std[offset], share * change.size * FIX_AXES)
                 time_s[offset] = _SLOW_S
             elif change.kind == "varies":
                 slip = state.WHEEL_SLIP if change.role == state.WHEELS else state.VISUAL_SLIP
@@ -228,33 +213,23 @@ def is_contradicted(tests: Tests, period_s: float) -> bool:
     return False
 
 
-def drop_outliers(ticks: Ticks, tests: Tests) -> tuple[NDArray[np.float64], tuple[Change, ...]]:
-    """Return the measurements of ticks without outliers, and the spans in which a sensor scatters so much that it is useless.
+def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
+    """Return the measurements of ticks without outliers, shape (K, 9, 3).
 
     A spike among its neighbours is an outlier, and so is a rejected measurement, except in a long run of rejections, which a change may
     explain.
     """
-    value, spans = ticks.inputs.value.copy(), list[Change]()
+    value = ticks.inputs.value.copy()
     for kind in (state.WHEELS, state.VISUAL, state.FIX):
-        rows = np.flatnonzero(np.isfinite(value[:, kind, 0]))
-        if rows.size < _SPAN_ROWS:
-            continue
-        axes, period_s = slice(state.SIZES[kind]), ticks.inputs.period_s
-        least = np.sqrt(ticks.inputs.variance[rows, kind, axes])
-        series = tests.fix_innovation[rows] if kind == state.FIX else value[rows, kind, axes]
-        is_spike = _find_spikes(series, least)
-        time_s = _MEDIAN_ROWS // 3 * period_s * np.median(np.diff(rows))  # from the middle of a window to its median
-        moved = 0.5 * _MAX_ACCELERATION_MPS2 * time_s * (time_s if kind == state.FIX else 1.0)
-        scattered = _find_spikes(value[rows, kind, axes], least + moved / SPIKE_RATIO)
-        useless = compute_moving_mean(1.0 * scattered, _SPAN_ROWS // 2, least=0.0) > _MIN_SPIKE_SHARE
-        rejected = tests.verdict[rows, kind] != ACCEPTED
-        for first, last in _find_long_runs(rows, rejected, period_s, kind):
-            rejected[first:last] = False
-        value[rows[is_spike | rejected], kind] = np.nan
-        for first, last in _find_long_runs(rows, useless, period_s, kind):
-            value[rows[first:last], kind] = np.nan
-            spans.append(Change("useless", kind, int(rows[first]), int(rows[last]) if last < rows.size else None))
-    return value, tuple(spans)
+        rows, axes = np.flatnonzero(np.isfinite(value[:, kind, 0])), slice(state.SIZES[kind])
+        if rows.size:
+            series = tests.fix_innovation[rows] if kind == state.FIX else value[rows, kind, axes]
+            is_spike = _find_spikes(series, np.sqrt(ticks.inputs.variance[rows, kind, axes]))
+            rejected = tests.verdict[rows, kind] != ACCEPTED
+            for first, last in _find_long_runs(rows, rejected, ticks.inputs.period_s, kind):
+                rejected[first:last] = False
+            value[rows[is_spike | rejected], kind] = np.nan
+    return value
 
 
 def _find_spikes(series: Floats, least: Floats) -> NDArray[np.bool_]:
@@ -301,3 +276,62 @@ def compute_evidence(tests: Tests, gates: Floats) -> float:
     """Return the log likelihood of all measurements; one beyond the gate counts as the gate."""
     kinds = [state.WHEELS, state.VISUAL, state.DOPPLER, state.FIX, state.ATTITUDE]
     return float(-0.5 * np.nansum(np.minimum(tests.nis[:, kinds], gates[kinds]) + tests.log_det[:, kinds]))
+
+
+_EXCURSION_STDS, _MAX_EXCURSION_RATIO = 4.0, 2.0
+"""Standard deviations of a residual that noise does not reach, and ratio of the residuals of two odometries that confirm each other [1]."""
+_MIN_RESIDUAL_VARIANCE = 1e-6
+"""Of a residual [m²]."""
+_MIN_EXCURSION_WINDOWS, _SHORT_WINDOW_S, _EXCURSION_WINDOW_S = 3, 4.0, 8.0
+"""Overlapping windows [1], the shortest that are compared [s], and the longest of a step or of a wrong lever arm in a turn [s]."""
+
+
+def find_excursions(residuals: Sequence[Residuals], noise: NoiseModel, ticks: Ticks) -> tuple[Change, ...]:
+    """Return the spans in which fixes moved otherwise than two odometries alike, far beyond the noise of the section.
+
+    A step at t is beyond in every window that holds t, an excursion only in windows as long as itself: where short windows are farther
+    beyond, there is a step.
+    """
+    size, of_fixes = (
+        ticks.stamp_ns.size,
+        [each for each in residuals if GNSS in each.pair and each.time_s > _SHORT_WINDOW_S],
+    )
+    found = sorted(
+        (run for pair in combinations(of_fixes, 2) for run in _find_excursion_runs(*pair, noise)), reverse=True
+    )
+    spans: list[tuple[int, int, float]] = []
+    for place, (_, time_s, start_ns, end_ns, off_m) in enumerate(found):
+        steps = [run for run in found[:place] if run[1] <= _EXCURSION_WINDOW_S]
+        if time_s > _EXCURSION_WINDOW_S and not any(run[2] < (start_ns + end_ns) // 2 < run[3] for run in steps):
+            spans.append((*np.searchsorted(ticks.stamp_ns, (start_ns, end_ns)).clip(0, size).tolist(), off_m))
+    changes: list[Change] = []
+    for first, last, off_m in sorted(spans):
+        before = changes.pop() if changes and first < (changes[-1].last or size) else Change("wander", state.FIX, first)
+        end, largest_m = max(last, before.last or 0), max(off_m, before.size)
+        changes.append(replace(before, last=None if end >= size else end, size=largest_m))
+    return tuple(changes)
+
+
+def _find_excursion_runs(
+    one: Residuals, other: Residuals, noise: NoiseModel
+) -> Iterator[tuple[float, float, int, int, float]]:
+    """Yield z², length [s], start and end [ns] and size [m] of each run of windows that both pairs of sensors contradict alike."""
+    if one.axis not in {ALONG, ACROSS} or one.axis != other.axis or abs(one.time_s / other.time_s - 1.0) > 0.1:
+        return
+    start_ns, *rows = np.intersect1d(one.start_ns, other.start_ns, return_indices=True)
+    value, variance = np.empty((2, 2, start_ns.size))
+    for k, each in enumerate((one, other)):
+        densities = noise.densities.get(each.axis, {})
+        sums = sum(
+            (densities.get(name, 0.0) * factor for name, factor in each.features.items()), np.zeros(each.value.size)
+        )
+        value[k], variance[k] = each.value[rows[k]], sums[rows[k]] + _MIN_RESIDUAL_VARIANCE
+    z2, ratio = (value**2 / variance).max(axis=0), value[0] / np.where(value[1], value[1], np.inf)
+    beyond = np.flatnonzero(
+        (z2 > _EXCURSION_STDS**2) & (ratio < _MAX_EXCURSION_RATIO) & (ratio > 1.0 / _MAX_EXCURSION_RATIO)
+    )
+    end_ns = one.end_ns[rows[0]]
+    for run in np.split(beyond, np.flatnonzero(start_ns[beyond][1:] >= end_ns[beyond][:-1]) + 1):
+        if run.size >= _MIN_EXCURSION_WINDOWS:
+            off_m = float(np.abs(value[0, run]).max())
+            yield float(z2[run].max()), one.time_s, int(start_ns[run[0]]), int(end_ns[run[-1]]), off_m

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion.level_motion import KNOT_S, get_turn_rates
 from tcpipe.fusion.measurements import GNSS, IMU, NO_TRUST, Measurements, Positions
-from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TIMES_S, TURN, TURN_S, UP, Residuals
+from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TIMES_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
 from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std, solve_non_negative
 from tcpipe.tables.facts import NoiseFacts
@@ -140,7 +140,7 @@ _PROCESS_STD = 0.6  # 1σ of the share of the claim [1] that one correlation tim
 _MOVING_STD = 0.02  # the same of errors that are there only while the robot moves
 _AXES_STD = 0.25  # 1σ of the difference of processes in the plane and of heights [1], by their total
 _MAX_PRIOR_GROWTH = 25.0  # largest factor [1] by which a prior's standard deviation grows with the density
-_ROUNDING = 1e-10  # variance of rounding [m² or rad²]
+_ROUNDING = 1e-10  # variance of rounding [m²]
 
 
 def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements:
@@ -163,17 +163,14 @@ def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> 
 
 
 def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> NoiseModel:
-    """Return the noise of each sensor by the residuals of `find_residuals`: yaw rates first, then the horizontal plane, then heights."""
+    """Return the noise of each sensor by the residuals of `find_residuals`: heights first, then the horizontal plane."""
     prior = make_prior_model(measurements)
     if not residuals:
         return prior
     section_ns = max(each.end_ns.max() for each in residuals) - min(each.start_ns.min() for each in residuals)
     longest_s = 1e-9 * float(section_ns) / _LEAST_WINDOWS
-    by_turns, by_heights = (
-        _Fit([each for each in residuals if each.axis == axis], prior, longest_s) for axis in (TURN, UP)
-    )
-    turns = {role: by_turns.find_noise(of, f"{role} turn", f"{role} bias") for role, of in prior.turns.items()}
-    prior, horizontal = replace(prior, turns=turns), prior.horizontal
+    by_heights = _Fit([each for each in residuals if each.axis == UP], prior, longest_s)
+    horizontal = prior.horizontal
     has_claims = measurements.gnss is not None and measurements.gnss.has_claims
     if has_claims and prior.vertical and prior.vertical.claimed_m2 < NO_TRUST:
         vertical = by_heights.find_noise(prior.vertical, "up white", "up process", "up moving")
@@ -188,10 +185,7 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
             role: plane.find_noise(of, f"{role} velocity", f"{role} scale") for role, of in prior.odometries.items()
         },
         shared_scale=plane.find_process(prior.shared_scale, "shared scale"),
-        densities={
-            axis: fit.get_densities()
-            for axis, fit in ((TURN, by_turns), (ALONG, plane), (ACROSS, plane), (UP, by_heights))
-        },
+        densities={axis: fit.get_densities() for axis, fit in ((ALONG, plane), (ACROSS, plane), (UP, by_heights))},
     )
 
 
@@ -352,12 +346,12 @@ def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
     if name.startswith(("fix ", "up ")) and prior.horizontal is not None and prior.vertical is not None:
         return _find_fix_prior(name, prior.horizontal, prior.vertical, prior.densities.get(UP, {}))
     known = PRIORS[kind if kind in PRIORS else name]
-    variance, taus = known.variance, TURN_S if kind.endswith((" bias", " turn scale")) else SCALE_S
-    if last == "turn" or (last == "velocity" and kind in prior.odometries):
-        variance = (prior.turns if last == "turn" else prior.odometries)[kind].white
+    variance = known.variance
+    if last == "velocity" and kind in prior.odometries:
+        variance = prior.odometries[kind].white
     elif kind == "heading scale":
         variance = _find_heading_variance(prior)
-    share = _share_process(known.time_s, float(last), taus) if known.time_s else 1.0
+    share = _share_process(known.time_s, float(last), SCALE_S) if known.time_s else 1.0
     return share * variance, known.times * variance
 
 
@@ -463,16 +457,13 @@ _DRIVING_MPS = 0.1
 
 
 def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFacts]:
-    """Return by name how far fixes along an axis, distances of odometries and turns err over each time, by the fit and by the claims.
-
-    Turns are without the error of their scale, which a straight drive does not feel.
-    """
+    """Return by name how far fixes along an axis and distances of odometries err over each time, by the fit and by the claims."""
     found = {}
     for name, fixes in ((GNSS, noise.horizontal), (f"{GNSS} height", noise.vertical)):
         if fixes is not None:
             correlated = fixes.correlated.difference_variance(_TIME_S), fixes.correlated.data_share
             fitted = [(np.full_like(_TIME_S, 2.0 * fixes.white), fixes.white_data_share), correlated]
-            found[name] = _make_facts("m", fitted, np.full_like(_TIME_S, 2.0 * fixes.claimed_m2))
+            found[name] = _make_facts(fitted, np.full_like(_TIME_S, 2.0 * fixes.claimed_m2))
     for role, odometry in m.odometries().items():
         speed_mps, own = np.abs(odometry.velocity_mps[:, 0]), noise.odometries[role]
         driving = speed_mps > _DRIVING_MPS
@@ -482,13 +473,7 @@ def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFact
             for each in (own.correlated, noise.shared_scale)
         ]
         fitted = [(own.white * _TIME_S, own.white_data_share), *scales]
-        found[role] = _make_facts("m", fitted, _sum_white(odometry.stamp_ns, odometry.variance_m2ps2[:, 0]))
-    for role, turns in noise.turns.items():
-        imu = m.imu if role == IMU else None
-        claimed = m.odometries()[role].yaw_rate_var if imu is None else np.array([imu.gyro_std_radps**2])
-        bias = turns.correlated.integral_variance(_TIME_S), turns.correlated.data_share
-        fitted = [(turns.white * _TIME_S, turns.white_data_share), bias]
-        found[f"{role} turn"] = _make_facts("rad", fitted, _sum_white(m.sensors()[role].stamp_ns, claimed))
+        found[role] = _make_facts(fitted, _sum_white(odometry.stamp_ns, odometry.variance_m2ps2[:, 0]))
     return found
 
 
@@ -497,9 +482,9 @@ def _sum_white(stamp_ns: NDArray[np.int64], variance: Floats) -> Floats:
     return np.asarray(np.nanmedian(variance) * compute_median_period_ns(stamp_ns) * 1e-9 * _TIME_S)
 
 
-def _make_facts(unit: str, fitted: Sequence[tuple[Floats, float]], claimed: Floats) -> NoiseFacts:
+def _make_facts(fitted: Sequence[tuple[Floats, float]], claimed: Floats) -> NoiseFacts:
     """Return the facts of variances over each time, each with the share of it that the data determine."""
     whole = np.sum([variance for variance, _ in fitted], axis=0)
     from_data = np.sum([share * variance for variance, share in fitted], axis=0) / whole
     rows = (np.sqrt(whole), np.sqrt(claimed), from_data)
-    return NoiseFacts(unit, TIMES_S, *(tuple(float(f"{value:.4g}") for value in row) for row in rows))
+    return NoiseFacts(TIMES_S, *(tuple(float(f"{value:.4g}") for value in row) for row in rows))

@@ -1,20 +1,24 @@
 """The default estimator: an error-state unscented filter on SE(3), and its smoother (`filter_kernel`: equations).
 
 Where sensors contradict each other for long, changes are searched that explain it (`changes`), and the section is estimated again.
+
+Memory is bounded: the forward pass keeps a checkpoint for each block of ticks; on the way back each block is filtered once more, this
+time with everything kept. The second filter repeats the arithmetic of the first exactly, gates included.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
-from tcpipe.fusion.attitude import STATED_MOUNTING_STD_RAD
 from tcpipe.fusion.changes import (
+    EVENTS,
     LARGER_ERRORS,
     POSSIBLE,
     ROLES,
@@ -22,63 +26,76 @@ from tcpipe.fusion.changes import (
     Hypothesis,
     compute_evidence,
     drop_outliers,
+    find_excursions,
     is_contradicted,
     join_events,
 )
 from tcpipe.fusion.dead_reckoning import compute_course
 from tcpipe.fusion.densities import PRIORS, NoiseModel, describe_noise, fit_noise, inflate_unclaimed_fixes
-from tcpipe.fusion.excursions import find_excursions
-from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, RESET, Memory, Model, Tests
+from tcpipe.fusion.filter_kernel import (
+    ACCEPTED,
+    NONE,
+    REJECTED,
+    RESET,
+    Memory,
+    Model,
+    Tests,
+    allocate_steps,
+    filter_ticks,
+)
 from tcpipe.fusion.initial import find_stationary_intervals
 from tcpipe.fusion.measurements import (
     DISPLACEMENT_LAGS_S,
     IMU,
+    NO_LEVER_ARM,
     NO_TRUST,
-    STATED_ARM_STD_M,
     UNSTATED_ARM_STD_M,
+    WHEELS,
     InitialState,
     Measurements,
     Rejections,
     Trajectory,
-    select_rows,
 )
 from tcpipe.fusion.pair_residuals import Residuals, find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, find_walk, make_model, make_priors, make_start, widen_start
-from tcpipe.fusion.passes import filter_section, smooth_section
 from tcpipe.fusion.process import (
     GROUND,
     SLOPE_RAD,
     UNSEEN_TURN_RADPS,
-    estimate_slope_std_rad,
     find_best_scale_std,
-    is_gliding,
     is_length_observable,
-    is_turned_by_course,
 )
-from tcpipe.fusion.smoother_kernel import Smoothed
+from tcpipe.fusion.smoother_kernel import (
+    LARGEST_EVENT,
+    SELDOM,
+    Candidates,
+    Smoothed,
+    make_adjoint,
+    smooth_ticks,
+)
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
-from tcpipe.tables.facts import FIX_ERRORS, ChangeFacts, GateReset, ParameterFacts, StretchFacts
+from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding, read_threshold
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_OF_ODOMETRY = {
-    state.WHEELS: (state.WHEEL_SCALE, state.WHEEL_SLIP, state.WHEEL_LAG),
-    state.VISUAL: (state.VISUAL_SCALE, state.VISUAL_SLIP, state.VISUAL_LAG),
-}
-"""Errors of an odometry: its mean scale, what it varies by, its lag."""
 _LEVELLING_S = 60.0
 """The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
-_MANY_FIXES = 50  # from so many on, their white noise is averaged out
 _JUDGED_M = 0.5  # fixes that claim more are not judged: motion carries the pose no better
 _UNCHANGED = Hypothesis(())
 _ARM_STDS, _SURE_STDS = 2.0, 4.0
 """How far off an antenna is that is not where it is stated: deviations of the stated place, and of the estimate [1]."""
 _MAX_EVENTS = 6
 """Events of a section [1]: two of them may be one change."""
+_BLOCK = 1024
+"""Ticks between checkpoints."""
+_MIN_EVENT_GAIN = 20.0
+"""Log evidence [nat] by which an event must explain more, beyond its cost: the best of a section's ticks reaches 12 by chance."""
+_SETTLING_S = 1.0
+"""Time after the start in which an event is an error of the start [s]."""
 _NEARLY_EXACT = 1e-4
 """Standard deviation of errors that are known exactly, in their unit, where events are searched: sigma points need a width."""
 _LEAST_GAIN, _LEAST_FURTHER_GAIN = 100.0, 8.0
@@ -161,7 +178,8 @@ class SectionModel:
     def make_start(self, initial: InitialState) -> Memory:
         """Return the state of all errors at the first tick."""
         gnss = self.measurements.gnss
-        return make_start(initial, self.std, (0.0, 0.0, 0.0) if gnss is None else gnss.lever_arm_m)
+        is_placed = gnss is not None and not self.measurements.is_antenna_alone
+        return make_start(initial, self.std, gnss.lever_arm_m if gnss is not None and is_placed else NO_LEVER_ARM)
 
     def filter(
         self,
@@ -191,7 +209,7 @@ class SectionModel:
         self, start: Memory, hypothesis: Hypothesis = _UNCHANGED, *, judges: bool = False
     ) -> tuple[Ticks, Model, Memory]:
         """Return ticks, model and start of a pass under a hypothesis; see `filter`."""
-        ticks = hypothesis.alter_ticks(self.ticks, drifts=not judges)
+        ticks = hypothesis.alter_ticks(self.ticks)
         std, walk, time_s = make_priors(self.measurements, self.noise, ticks)
         hypothesis.alter_priors(std, walk, time_s)
         if judges and self.measurements.imu is not None:  # a jump of the bias has made the walk that was fitted larger
@@ -205,7 +223,6 @@ class SectionModel:
             gate_probability=self.gate_probability,
             time_s=time_s,
             follows=not judges,
-            ignored=hypothesis.ignored,
             possible=POSSIBLE if judges else (),
         )
         return ticks, model, widen_start(start, std).select(model.active)
@@ -243,18 +260,12 @@ class SectionModel:
             return Hypothesis(excursions)
         if len(best.changes) <= most and not is_contradicted(tests_of_best, period_s):
             return best
-        # Errors may be larger than usual throughout: spans of wrong fixes would explain it, too.
+        # Errors may be larger than usual throughout: many changes would explain that, too.
         larger, tests = self._find_larger_errors(plain, tests, start)
         if not larger.changes:
             return best
         larger, _ = self._add_events(larger, tests, start)
-        has_wrong_span = len(best.changes) > 1 and any(change.kind in {"offset", "useless"} for change in best.changes)
-        varies = any(change.kind == "varies" for change in larger.changes)
-        has_varying_scale = varies and sum(change.kind == "scale" for change in best.changes) > most
-        if best.score > larger.score and not has_wrong_span and not has_varying_scale:
-            return best
-        rivals = 0 if has_varying_scale else sum(change.kind not in FIX_ERRORS for change in best.changes)
-        return replace(larger, rival_change_count=rivals if best.score > larger.score + _LEAST_GAIN else 0)
+        return larger if len(best.changes) > most else max(best, larger, key=lambda each: each.score)
 
     def _find_larger_errors(self, plain: Hypothesis, tests: Tests, start: Memory) -> tuple[Hypothesis, Tests]:
         """Return the most likely errors that are larger than usual throughout, and the tests under them."""
@@ -278,17 +289,15 @@ class SectionModel:
 
     def _add_events(self, given: Hypothesis, tests: Tests, start: Memory) -> tuple[Hypothesis, Tests]:
         """Return a hypothesis with the events that explain most beyond it, found one after the other; ``tests`` are of its pass."""
-        best, events, useless = (given, tests), list[Change](), tuple[Change, ...]()
+        best, events = (given, tests), list[Change]()
         for _ in range(_MAX_EVENTS):
-            kept, spans = drop_outliers(self.ticks, best[1])
-            if not events and spans:
-                useless, best = spans, self._judge((*given.changes, *spans), start)
+            kept = drop_outliers(self.ticks, best[1])
             hypothesis = replace(given, changes=(*given.changes, *events))
             likely = smooth_section(self.filter(start, hypothesis, judges=True, kept=kept), with_displacements=False)[1]
             if not likely:
                 break
             events.append(likely[0])
-            best = self._judge((*given.changes, *useless, *join_events(events)), start)
+            best = self._judge((*given.changes, *join_events(events)), start)
         return best
 
     def _judge(self, changes: Sequence[Change], start: Memory) -> tuple[Hypothesis, Tests]:
@@ -299,6 +308,76 @@ class SectionModel:
         made = self.filter(start, Hypothesis(tuple(changes)), judges=True)
         score = compute_evidence(made.tests, made.model.gates) - sum(change.cost for change in changes)
         return Hypothesis(tuple(changes), score), made.tests
+
+
+def make_tests(size: int) -> Tests:
+    """Return tests to be filled."""
+    shape = size, state.KINDS
+    return Tests(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.int8), np.full((size, 3), np.nan))
+
+
+def _list_blocks(size: int) -> list[tuple[int, int]]:
+    """Return first and last tick, the latter excluded, of each block."""
+    return list(pairwise([*range(0, size, _BLOCK), size]))
+
+
+def filter_section(ticks: Ticks, model: Model, start: Memory, *, until: int | None = None) -> Pass:
+    """Return the forward pass from a start, over all ticks or those before ``until``."""
+    size = min(until or ticks.stamp_ns.size, ticks.stamp_ns.size)
+    made = Pass(ticks, model, [], make_tests(size), np.zeros((size, state.NX)), start.copy())
+    empty = allocate_steps(0, model.active.size)
+    for first, last in _list_blocks(size):
+        made.checkpoints.append(made.last.copy())
+        filter_ticks(first, last, ticks.inputs, model, made.last, False, empty, made.tests, made.states)
+    return made
+
+
+def smooth_section(made: Pass, *, with_displacements: bool = True) -> tuple[Smoothed, tuple[Change, ...]]:
+    """Return the smoothed estimate of a forward pass, and events that explain much more of it than they cost, the most likely first."""
+    size, n = made.states.shape[0], made.model.active.size
+    lags = np.array([round(lag_s / made.ticks.inputs.period_s) for lag_s in DISPLACEMENT_LAGS_S])
+    adjoint = make_adjoint(n, int(lags.max()) if with_displacements else 0)
+    possible, candidates = _list_candidates(made)
+    out = Smoothed(
+        np.zeros_like(made.states),
+        np.zeros((size, 5)),
+        np.full((size, lags.size), np.nan),
+        np.zeros((-(-size // SELDOM), n)),
+    )
+    steps, again, filtered = allocate_steps(min(size, _BLOCK), n), make_tests(size), np.zeros_like(made.states)
+    for (first, last), memory in zip(reversed(_list_blocks(size)), reversed(made.checkpoints), strict=True):
+        steps.used[:] = False
+        filter_ticks(first, last, made.ticks.inputs, made.model, memory.copy(), True, steps, again, filtered)
+        smooth_ticks(first, last, made.ticks.inputs, made.model, steps, filtered, lags, adjoint, candidates, out)
+    gains = candidates.best[:, 0] - np.array([EVENTS[key].cost for key in possible])
+    events = []
+    for row in np.argsort(-gains, kind="stable"):
+        (kind, role), count, (_, tick, *change) = possible[row], candidates.sizes[row], candidates.best[row].tolist()
+        event = Change(
+            kind,
+            role,
+            int(tick) if np.isfinite(tick) else 0,
+            size=float(np.linalg.norm(change[: min(count, 3)])),
+            impulse=tuple(change[:count]),
+            impulse_std=tuple(change[LARGEST_EVENT : LARGEST_EVENT + count]),
+        )
+        if gains[row] >= _MIN_EVENT_GAIN and event.size >= EVENTS[kind, role].least:
+            events.append(event)
+    return out, tuple(events)
+
+
+def _list_candidates(made: Pass) -> tuple[list[tuple[str, int]], Candidates]:
+    """Return the events whose errors the model has."""
+    position = {int(error): place for place, error in enumerate(made.model.active)}
+    possible = [key for key, kind in EVENTS.items() if all(error in position for error, _ in kind.block)]
+    shape = len(possible), LARGEST_EVENT
+    places, stds, sizes = np.zeros(shape, np.int64), np.ones(shape), np.zeros(shape[0], np.int64)
+    for row, key in enumerate(possible):
+        block = EVENTS[key].block
+        sizes[row] = len(block)
+        places[row, : len(block)], stds[row, : len(block)] = zip(*((position[e], std) for e, std in block), strict=True)
+    earliest, best = round(_SETTLING_S / made.ticks.inputs.period_s), np.full((shape[0], 2 + 2 * shape[1]), -np.inf)
+    return possible, Candidates(places, stds, sizes, earliest, best)
 
 
 def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
@@ -319,48 +398,22 @@ def make_trajectory(
     position_variance, speed_variance = variances[:, :3].copy(), variances[:, 4].copy()
     speed = np.linalg.norm(velocity, axis=1)
     links = _interpolate_links(smoothed, at, output_ns)
-    antenna = np.zeros(3) if m.gnss is None else np.asarray(m.gnss.lever_arm_m)
-    slope_std = estimate_slope_std_rad(m) or SLOPE_RAD
-    tilted = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2 * slope_std**2)
     if m.gnss is not None and not m.gnss.has_heights:
         position_variance[:, 2] += NO_TRUST
-        is_tilt_seen = (
-            m.imu is not None or m.has_posed_tilt or (m.visual is not None and m.visual.turn_rate_radps is not None)
-        )
-        if not is_tilt_seen:  # nothing shows a slope, by which the antenna sways
-            position_variance[:, :2] += (slope_std * antenna[2]) ** 2
-    if is_gliding(m):  # level, and along the course
+    if m.gnss is not None and m.is_antenna_alone:  # level, and along the course
+        antenna = np.asarray(m.gnss.lever_arm_m)
         yaw = compute_course(velocity)
         rotation = matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw))
         rate = np.zeros((yaw.size, 3))
         rate[:, 2] = np.gradient(yaw, (output_ns - output_ns[0]) * 1e-9) if yaw.size > 1 else 0.0
+        yaw_variance = _ANY_YAW_STD_RAD**2 * speed_variance / (speed_variance + speed**2)
         position -= rotation @ antenna
-        position_variance[:, :2] += (slope_std * antenna[2]) ** 2
-        speed_variance = speed_variance + (UNSEEN_TURN_RADPS * antenna[2]) ** 2
-        links = links + tilted * antenna[2] ** 2
-    elif is_turned_by_course(m) and not m.has_posed_tilt:
-        # The course takes a sway of the antenna for a turn: nothing tells one from the other, and roll is taken to be none.
-        position_variance[:, :2] += (slope_std * antenna[2] * rotation[:, :2, 1]) ** 2
-    if noise.horizontal is not None and noise.vertical is not None:
-        # What fixes claim beyond what the run shows lasts longer than the run can show.
-        for axes, fix in ((slice(0, 2), noise.horizontal), (slice(2, 3), noise.vertical)):
-            position_variance[:, axes] += max(0.0, fix.claimed_m2 - fix.white - fix.correlated.variance)
-    if m.gnss is not None and m.imu is None and not m.has_posed_tilt:
-        turned = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
-        # Without a gyroscope the noise of roll passes for sway: the height of the antenna is no better known than it was stated.
-        unseen = np.asarray(m.gnss.lever_arm_std_m) * [not std[state.ARM], not std[state.ARM + 1], 1.0]
-        variance, moved = _compute_arm_variance(unseen, rotation, turned, made)
-        position_variance += variance
-        # The noise of tilt holds the sway of an antenna whose height is known as well as a stated one.
-        links = links + moved + tilted * max(0.0, unseen[2] ** 2 - STATED_ARM_STD_M[2] ** 2)
-    if m.imu is None and not m.odometries() and not _is_yaw_measured(m):
-        # From positions alone forward and reverse look the same: yaw may be anything, and so the place below the antenna.
-        beside = rotation @ antenna
-        aside, above = np.sum(beside[:, :2] ** 2, axis=1), 2 * (rotation[:, 2, :2] @ antenna[:2]) ** 2
-        position_variance += np.column_stack((aside, aside, above))
-        yaw_variance = yaw_variance + _ANY_YAW_STD_RAD**2
-        speed_variance = speed_variance + 1.5 * speed**2
-    scale_std = _compute_unseen_scale_std(m, noise, made)
+        position_variance[:, :2] += (yaw_variance * np.sum(antenna[:2] ** 2))[:, None]
+        speed_variance += (UNSEEN_TURN_RADPS * antenna[2]) ** 2
+        slope_variance = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2.0 * SLOPE_RAD**2)
+        links = links + slope_variance * antenna[2] ** 2
+    is_open = m.odometries() and not is_length_observable(m, noise.horizontal)
+    scale_std = find_best_scale_std(m) if is_open else 0.0
     if m.gnss is None:
         position_variance += (scale_std * (position - position[0])) ** 2
     links = links + (scale_std * speed[:, None] * DISPLACEMENT_LAGS_S) ** 2
@@ -376,13 +429,7 @@ def make_trajectory(
         rejections=_make_rejections(m, made),
         displacement_std_m=np.sqrt(links),
         facts=replace(_make_facts(m, made, smoothed, std, scale_std, explained), noise=describe_noise(m, noise)),
-        corrected=_correct_measurements(m, made, smoothed, explained),
     )
-
-
-def _is_yaw_measured(m: Measurements) -> bool:
-    """Return whether a pose shows where the robot looks; how one that nothing places is turned is told by the direction of motion."""
-    return m.gnss is not None and m.has_attitude and m.gnss.mounting_std_rad <= STATED_MOUNTING_STD_RAD
 
 
 def _make_motion(x: Floats, ticks: Ticks, at: Ints) -> tuple[Floats, Floats, Floats]:
@@ -416,35 +463,6 @@ def _interpolate_links(smoothed: Smoothed, at: Ints, output_ns: Ints) -> Floats:
         row = np.searchsorted(output_ns, later).clip(0, output_ns.size - 1)
         found[np.abs(output_ns[row] - later) > 0.1e9 * lag_s, column] = np.nan
     return found
-
-
-def _compute_arm_variance(std: Floats, rotation: Floats, yaw: Floats, made: Pass) -> tuple[Floats, Floats]:
-    """Return the variance that an antenna whose place nothing shows adds to positions, (N, 3), and to displacements, (N, 6) [m²]."""
-    moved = np.zeros((yaw.size, len(DISPLACEMENT_LAGS_S)))
-    for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):
-        rows = round(lag_s / made.ticks.inputs.period_s)
-        turned = np.zeros(yaw.size)
-        turned[: max(yaw.size - rows, 0)] = yaw[rows:] - yaw[:-rows] if yaw.size > rows else 0.0
-        moved[:, column] = (2.0 * np.sin(0.5 * turned)) ** 2 * std[0] * std[1]
-    return np.einsum("nij,j->ni", rotation**2, std**2), moved
-
-
-def _compute_unseen_scale_std(m: Measurements, noise: NoiseModel, made: Pass) -> float:
-    """Return the uncertainty of the odometry's scale that the fixes leave: their error at both ends of the ground that they span.
-
-    It is at most the scale's own deviation. The white part of the error of many fixes is the filter's business.
-    """
-    if not m.odometries():
-        return 0.0
-    own = find_best_scale_std(m)
-    used = np.flatnonzero(made.tests.verdict[:, state.FIX] == ACCEPTED)
-    if used.size < 2 or not is_length_observable(m, noise.horizontal):
-        return own
-    place, variance = made.ticks.inputs.value[used, state.FIX], made.ticks.inputs.variance[used, state.FIX, 0]
-    few_m2 = np.median(variance) if used.size < _MANY_FIXES else 0.0
-    span_m = np.linalg.norm(np.ptp(place[:, :2], axis=0))
-    lasting_m2 = np.median(made.ticks.fix_variance_m2[used, 0])
-    return float(min(own, np.sqrt(2.0 * max(lasting_m2, few_m2)) / max(span_m, 1e-3)))
 
 
 def _list_rows(m: Measurements, made: Pass) -> Mapping[int, tuple[Ints, Ints]]:
@@ -487,48 +505,15 @@ def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     return tuple(sorted(found, key=lambda each: each.start_ns))
 
 
-def _correct_measurements(m: Measurements, made: Pass, smoothed: Smoothed, explained: Hypothesis) -> Measurements:
-    """Return fixes and odometry without what the estimate found to be wrong with them, as the audit compares them with the track."""
-    changes = [c for c in explained.changes if c.kind in {"useless", "offset", "wander"}]
-    rows, found = made.ticks.rows, {}
-    for kind, name in ((state.FIX, "gnss"), (state.WHEELS, "wheels"), (state.VISUAL, "visual")):
-        source = getattr(m, name)
-        if source is None:
-            continue
-        tick = rows[kind].clip(0, made.states.shape[0] - 1)
-        x = smoothed.states[tick, 6:]
-        if kind == state.FIX:
-            rotation = smoothed.states[tick, :9].reshape(-1, 3, 3)
-            moved = x[:, state.ARM : state.ARM + 3] - np.asarray(source.lever_arm_m)
-            late = x[:, state.FIX_LAG, None] * np.einsum("nij,nj->ni", rotation, x[:, state.U : state.U + 3])
-            off = np.einsum("nij,nj->ni", rotation, moved) - late
-            corrected = replace(source, position_enu_m=source.position_enu_m - off)
-        else:
-            mean, slip, lag = _OF_ODOMETRY[kind]
-            scale = 1.0 + x[:, mean] + x[:, slip] + x[:, state.SHARED_SCALE]
-            stamp_ns = source.stamp_ns - round(float(np.median(x[:, lag])) * 1e9)
-            corrected = replace(source, stamp_ns=stamp_ns, velocity_mps=source.velocity_mps / scale[:, None])
-        kept = np.ones(tick.size, np.bool_)
-        for change in changes:
-            if change.role == kind:
-                kept &= (tick < change.first) | (tick >= (change.last or made.states.shape[0]))
-        found[name] = corrected if kept.all() else select_rows(corrected, kept)
-    if m.imu is not None:
-        at = np.searchsorted(made.ticks.stamp_ns, m.imu.stamp_ns).clip(0, made.states.shape[0] - 1)
-        bias = smoothed.states[at, state.GYRO_BIAS + 6 : state.GYRO_BIAS + 9]
-        found["imu"] = replace(m.imu, angular_velocity_radps=m.imu.angular_velocity_radps - bias)
-    return replace(m, **found)
-
-
 def _list_changes(made: Pass, smoothed: Smoothed, explained: Hypothesis) -> Iterator[ChangeFacts]:
     """Yield the changes that explain the run best."""
     for change in explained.changes:
-        last = change.last or made.states.shape[0] - 1
-        size = change.size
+        last, size, role = change.last or made.states.shape[0] - 1, change.size, ROLES[change.role]
         if change.kind == "varies":
-            mean, slip, _ = _OF_ODOMETRY[change.role]
-            size = float((smoothed.states[:, mean + 6] + smoothed.states[:, slip + 6]).std())
-        role = ROLES[change.role]
+            places = (
+                (state.WHEEL_SCALE, state.WHEEL_SLIP) if role == WHEELS else (state.VISUAL_SCALE, state.VISUAL_SLIP)
+            )
+            size = float(smoothed.states[:, [place + 6 for place in places]].sum(axis=1).std())
         start_ns, end_ns = made.ticks.stamp_ns[[change.first, last]].tolist()
         yield ChangeFacts(change.kind, role, start_ns, end_ns, size)
 
@@ -551,7 +536,6 @@ def _make_facts(  # noqa: PLR0917
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, smoothed, explained)),
         common_scale_std=scale_std,
-        rival_change_count=explained.rival_change_count,
         parameters=_describe_parameters(m, made, smoothed, std),
     )
 

@@ -98,7 +98,6 @@ class Model(NamedTuple):
     scales : by kind, the place in ``active`` of the sensor's own scale; -1: none.
     events : changes of errors: (tick, place in ``active``, whether the error is another one now); (e, 3).
     sizes, shifts : variance that each event adds, and by how much it changes the error, (e,).
-    ignored : measurements that are predicted and not used: (kind, first tick, last tick, the latter excluded), (i, 3).
     """
 
     active: Indices
@@ -113,7 +112,6 @@ class Model(NamedTuple):
     events: NDArray[np.int64]
     sizes: Vector
     shifts: Vector
-    ignored: NDArray[np.int64]
 
 
 class Memory(NamedTuple):
@@ -206,8 +204,7 @@ def _solve_for_map(M: Matrix, rows: int, L: Matrix, m: int, F: Matrix) -> None:
 @compile_kernel
 def _draw_sigma_point(i: int, m: int, active: Indices, places: Indices, L: Matrix, d: Vector) -> None:
     """Fill d with the errors of the i-th sigma point: √3 times a column of the factor of P at m places."""
-    for e in range(N):
-        d[e] = 0.0
+    d[:] = 0.0
     for r in range(i, m):
         d[active[places[r]]] = _SPREAD * L[r, i]
 
@@ -221,9 +218,7 @@ def _move(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, F: Matrix,
     places, m, n = model.depends[row], model.counts[row], P.shape[0]
     move_state(x, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], centre, turn)
     factorize(P, places, m, L)
-    for a in range(m):
-        for b in range(m):
-            missed[a, b] = 0.0
+    missed[:] = 0.0
     for i in range(m):
         _draw_sigma_point(i, m, model.active, places, L, d)
         displace_state(x, d, 1.0, low, turn)
@@ -245,17 +240,15 @@ def _move(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, F: Matrix,
                 missed[a, b] += d[model.active[places[a]]] * d[model.active[places[b]]] / 3.0
     _solve_for_map(M, m, L, m, F)
     for a in range(m):
-        for j in range(n):
-            W[a, j] = 0.0
+        W[a] = 0.0
         for b in range(m):
             f = F[a, b]
             line = P[places[b]]
             for j in range(n):
                 W[a, j] += f * line[j]
     for a in range(m):
-        for j in range(n):
-            P[places[a], j] = W[a, j]
-            P[j, places[a]] = W[a, j]
+        P[places[a]] = W[a]
+        P[:, places[a]] = W[a]
     for a in range(m):
         for b in range(a + 1):
             s = missed[a, b]
@@ -263,8 +256,7 @@ def _move(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, F: Matrix,
                 s += W[a, places[c]] * F[b, c]
             P[places[a], places[b]] = s
             P[places[b], places[a]] = s
-    for j in range(NX):
-        x[j] = centre[j]
+    x[:] = centre
     for e in range(3):  # rotation and velocity are always active, and first
         P[THETA + e, THETA + e] += inputs.noise[k, e]
         P[U + e, U + e] += inputs.noise[k, 3 + e]
@@ -284,9 +276,8 @@ def _decay(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, kept: Vec
     for i in range(n):
         if kept[i] != 1.0:
             x[model.active[i] + 6] *= kept[i]
-            for j in range(n):
-                P[i, j] *= kept[i]
-                P[j, i] *= kept[i]
+            P[i] *= kept[i]
+            P[:, i] *= kept[i]
         P[i, i] += model.noise[i]
         if FIX_ERROR <= model.active[i] < FIX_ERROR + 3:
             P[i, i] += inputs.fix_noise[k, model.active[i] - FIX_ERROR]
@@ -309,12 +300,9 @@ def _compare(
     lever = inputs.attitude[k] if kind == ATTITUDE else inputs.levers[kind]
     centre = S[0]
     predict_measurement(kind, x, rate, gyro, acceleration, tau, lever, centre)
-    for a in range(size):
-        y[a] = centre[a]
+    y[:] = centre
     factorize(P, places, m, L)
-    for a in range(3):
-        for b in range(3):
-            missed[a, b] = 0.0
+    missed[:3, :3] = 0.0
     for i in range(m):
         _draw_sigma_point(i, m, model.active, places, L, d)
         displace_state(x, d, 1.0, high, turn)
@@ -331,9 +319,7 @@ def _compare(
                 missed[a, b] += P[THETA + 2, THETA + 2] * P[RHO, RHO] * x[3 * a + 1] * x[3 * b + 1]
     _solve_for_map(M, size, L, m, Hs)
     for a in range(size):
-        for j in range(n):
-            H[a, j] = 0.0
-            cross[a, j] = 0.0
+        H[a], cross[a] = 0.0, 0.0
         for i in range(m):
             h = Hs[a, i]
             H[a, places[i]] = h
@@ -418,8 +404,7 @@ def _correct(x: Vector, P: Matrix, active: Indices, size: int, gain: Any, K: Mat
     y, _, _, cross, _, inverse = gain
     d, high, small = room[4], room[5], room[8]
     n = P.shape[0]
-    for e in range(N):
-        d[e] = 0.0
+    d[:] = 0.0
     for a in range(size):
         for j in range(n):
             s = 0.0
@@ -433,8 +418,7 @@ def _correct(x: Vector, P: Matrix, active: Indices, size: int, gain: Any, K: Mat
             for j in range(n):
                 P[i, j] -= f * cross[a, j]
     displace_state(x, d, 1.0, high, small)
-    for j in range(NX):
-        x[j] = high[j]
+    x[:] = high
     _make_turn(d[0], d[1], d[2], turn)
     turn_rows(P, turn, n, False)
     turn_rows(P.T, turn, n, False)
@@ -508,11 +492,7 @@ def filter_ticks(
             _move(k, inputs, model, x, P, F, room)
             _decay(k, inputs, model, x, P, kept)
         if keep and k > 0:
-            for i in range(MOST):
-                for j in range(MOST):
-                    steps.F[k - first, i, j] = F[i, j]
-            for i in range(n):
-                steps.kept[k - first, i] = kept[i]
+            steps.F[k - first], steps.kept[k - first] = F, kept
         acceleration[0] = inputs.acceleration[k]
         for kind in range(KINDS):
             waits[kind, 1] += inputs.period_s
@@ -525,14 +505,8 @@ def filter_ticks(
             tests.log_det[k, kind] = log_det
             verdict = ACCEPTED
             if kind == FIX:
-                for a in range(3):
-                    tests.fix_innovation[k, a] = y[a]
-            is_used = nis <= model.gates[kind]
-            for j in range(model.ignored.shape[0]):
-                if model.ignored[j, 0] == kind and model.ignored[j, 1] <= k < model.ignored[j, 2]:
-                    is_used = False
-                    waits[kind, 1] = 0.0
-            if not is_used:
+                tests.fix_innovation[k] = y
+            if not nis <= model.gates[kind]:
                 verdict = REJECTED
                 waits[kind, 0] += 1.0
                 is_alone = True
@@ -551,21 +525,13 @@ def filter_ticks(
             _correct(x, P, model.active, size, gain, K, turn, room)
             if keep:
                 row = k - first
-                steps.used[row, kind] = True
+                steps.used[row, kind], steps.inverse[row, kind], steps.turn[row, kind] = True, inverse, turn
+                steps.K[row, kind], steps.H[row, kind] = K, H
                 for a in range(size):
                     s = 0.0
                     for b in range(size):
-                        steps.inverse[row, kind, a, b] = inverse[a, b]
                         s += inverse[a, b] * y[b]
                     steps.pull[row, kind, a] = s
-                    for j in range(n):
-                        steps.K[row, kind, a, j] = K[a, j]
-                        steps.H[row, kind, a, j] = H[a, j]
-                for j in range(18):
-                    steps.turn[row, kind, j] = turn[j]
-        for j in range(NX):
-            states[k, j] = x[j]
+        states[k] = x
         if keep:
-            for i in range(n):
-                for j in range(n):
-                    steps.P[k - first, i, j] = P[i, j]
+            steps.P[k - first] = P

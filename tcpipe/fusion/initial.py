@@ -3,8 +3,7 @@
 Yaw comes from the course over ground: the path that the odometry and the gyroscope draw from an arbitrary yaw is laid over the GNSS fixes
 by the rotation that fits best (the planar case of Wahba's problem: the angle of the sum of products of complex numbers). At least
 5 m at 0.2 m/s or more are asked for, ten standard deviations of the fixes where that is longer. Since the odometry's velocity has a
-sign, a run may start in reverse; since the path is drawn, it may start with a turn. Roll and pitch come from the specific force,
-or from the unit's own orientation where the two agree.
+sign, a run may start in reverse; since the path is drawn, it may start with a turn. Roll and pitch come from the specific force.
 
 The robot is stationary where the wheels do not turn and the gyroscope is quiet; wheels at rest on a robot that slides, or a gyroscope at
 rest on a straight, are not enough. It gives two more measurements (zero velocity, and the gyroscope's bias) and the initial bias.
@@ -14,17 +13,19 @@ Source: B. K. P. Horn, "Closed-form solution of absolute orientation using unit 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS, reckon_dead
-from tcpipe.fusion.measurements import InertialMeasurements, InitialState, Measurements, Positions
+from tcpipe.fusion.dead_reckoning import reckon_dead
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.signals import (
     Plane,
     compute_interval_means,
+    compute_median_period_ns,
     compute_seconds,
+    compute_slopes,
     compute_window_means,
     remove_wild_places,
 )
@@ -36,10 +37,9 @@ Ints = NDArray[np.int64]
 _MIN_COURSE_M = 5.0  # driven before course gives yaw (ruling)
 _MIN_COURSE_STD = 10.0  # distance over σ of fixes: yaw to 6°
 _MAX_WINDOW_S, _WINDOW_STEP_S = 120.0, 2.0  # longest window of fixes that shows the yaw; from one window to the next
-_TILT_AGREES_RAD = 0.2  # agreement of IMU attitude and gravity
 _GYRO_BIAS_STD_RADPS = 0.02  # turn-on bias of a MEMS gyroscope, 1°/s
 _POSED_YAW_STD_RAD = 0.1  # of a pose: its frame, and how its sensor is turned
-_START_STD_MPS = 1.0  # change of the velocity while the first fixes show it
+_ANY_SPEED_MPS = 2.0  # σ of a velocity that no sensor shows [m/s]
 _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
 
 
@@ -76,78 +76,61 @@ def _estimate_gyro_bias(imu: InertialMeasurements | None, stationary_ns: Ints) -
 
 def _estimate_tilt(imu: InertialMeasurements | None, stationary_ns: Ints, start_ns: int) -> tuple[float, float, float]:
     """Return roll and pitch [rad] at the start, and their standard deviation."""
-    if imu is None:
+    if imu is None or not imu.accelerometer_usable:
         return 0.0, 0.0, 0.2
     stands = stationary_ns.size > 0 and stationary_ns[0, 0] < start_ns + 2_000_000_000
     first, end = stationary_ns[0].tolist() if stands else (start_ns, start_ns + 1_500_000_000)
-    own = _read_orientation(imu, start_ns, end)
-    if not imu.accelerometer_usable:
-        return (0.0, 0.0, 0.2) if own is None else (own[0], own[1], 0.05)
     span_s = np.array([[first - start_ns], [end - start_ns]]) * 1e-9
     fx, fy, fz = compute_interval_means(compute_seconds(imu.stamp_ns, start_ns), imu.specific_force_mps2, *span_s)[0]
     roll, pitch = float(np.arctan2(fy, fz)), float(np.arctan2(-fx, np.hypot(fy, fz)))
-    if own is not None and max(abs(own[0] - roll), abs(own[1] - pitch)) < _TILT_AGREES_RAD and not stands:
-        return own[0], own[1], 0.05
     return roll, pitch, 0.03 if stands else 0.08
 
 
-def _read_orientation(imu: InertialMeasurements, start_ns: int, end_ns: int) -> list[float] | None:
-    """Return roll, pitch and yaw [rad] by the first orientation of the unit between two stamps; None without."""
-    known = np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns) & (imu.stamp_ns <= end_ns)
-    return rpy_from_quat(imu.quat_xyzw[np.argmax(known)]).tolist() if known.any() else None
-
-
 class _Path:
-    """The path by `DeadReckoning`; without odometry it goes straight on with the velocity that the first fixes show."""
+    """The path by `DeadReckoning`; without odometry the robot drives forward as fast as the fixes do, with an antenna alone anywhere."""
 
-    def __init__(self, measurements: Measurements, start_ns: int, bias: Floats) -> None:
-        gnss = measurements.gnss
-        self.start_ns, self.known = start_ns, measurements.first_odometry is not None
-        self.reckoned = reckon_dead(measurements, start_ns, float(bias[2]))
-        self._lever = 0j if gnss is None else complex(*gnss.lever_arm_m[:2])
-        self.first_fixes, self._straight, self._straight_std = slice(0, 10), 0j, 0.0
-        if gnss is not None and not self.known:
-            self.first_fixes, self._straight, self._straight_std = _fit_first_velocity(gnss)
+    def __init__(self, m: Measurements, start_ns: int, bias: Floats) -> None:
+        self.start_ns, self.is_shown, self._has_odometry = start_ns, not m.is_antenna_alone, bool(m.odometries())
+        if m.gnss is not None and self.is_shown and not self._has_odometry:
+            m = replace(m, wheels=_read_speeds(m.gnss))
+        self.reckoned = reckon_dead(m, start_ns, float(bias[2]))
+        self._lever = 0j if m.gnss is None else complex(*m.gnss.lever_arm_m[:2])
 
     def antenna(self, at_s: Floats, yaw: float = 0.0) -> Plane:
         """Return the antenna east + i north [m] for a yaw at the start [rad]."""
         body = self.reckoned.place(at_s) + self._lever * np.exp(1j * self.reckoned.yaw(at_s))
-        placed: Plane = body * np.exp(1j * yaw) + self._straight * at_s
+        placed: Plane = body * np.exp(1j * yaw)
         return placed
-
-    def length(self, until_s: float) -> float:
-        """Return the distance driven since the start [m]."""
-        return self.reckoned.length(until_s) if self.known else abs(self._straight) * max(until_s, 0.0)
 
     def start_velocity(self, yaw: float, pitch: float) -> tuple[Floats, float]:
         """Return the velocity at the start and its standard deviation [m/s]."""
-        if not self.known:
-            return np.array([self._straight.real, self._straight.imag, 0.0]), self._straight_std
-        speed = float(np.median(self.reckoned.forward_mps[:5]))
-        return speed * np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]), 0.3
+        if not self.reckoned.forward_mps.size:
+            return np.zeros(3), _ANY_SPEED_MPS
+        speed, std_mps = float(np.median(self.reckoned.forward_mps[:5])), 0.3 if self._has_odometry else 1.0
+        return speed * np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]), std_mps
 
 
-def _fit_first_velocity(gnss: Positions) -> tuple[slice, complex, float]:
-    """Return the fixes of the first second, 3 to 10, and the median of their slopes, east + i north, and its standard deviation [m/s]."""
-    rows = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 1_000_000_000, "right"), 3, 10)))
-    at_s, place = compute_seconds(gnss.stamp_ns[rows], int(gnss.stamp_ns[0])), gnss.position_enu_m[rows, :2]
-    if at_s.size < 2:
-        return rows, 0j, _START_STD_MPS
-    i, j = np.triu_indices(at_s.size, 1)
-    east, north = np.median((place[j] - place[i]) / (at_s[j] - at_s[i])[:, None], axis=0)
-    noise_mps = np.sqrt(12.0 / at_s.size * np.median(gnss.variance_m2[rows, :2])) / at_s[-1]
-    return rows, complex(east, north), float(np.hypot(noise_mps, _START_STD_MPS))
+def _read_speeds(gnss: Positions) -> BodyVelocities:
+    """Return how fast fixes move, as the odometry of a robot that drives forward."""
+    places, window_s = remove_wild_places(gnss.position_enu_m), max(1.0, 3e-9 * compute_median_period_ns(gnss.stamp_ns))
+    velocity, unknown = np.full((2, places.size, 3), np.nan)
+    velocity[:, 0] = np.hypot(*(compute_slopes(gnss.stamp_ns, axis, window_s) for axis in (places.real, places.imag)))
+    return BodyVelocities(gnss.stamp_ns, velocity, unknown, unknown[:, 0])
 
 
 def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_std: float) -> tuple[float, float, str]:
     """Return the yaw at the start [rad], its standard deviation, and its source."""
     gnss, imu = measurements.gnss, measurements.imu
-    rpy = None if imu is None else _read_orientation(imu, start_ns, int(imu.stamp_ns[-1]))
-    own, source = (0.0, "") if rpy is None else (rpy[2], "orientation")
+    oriented = (
+        np.empty((0, 4))
+        if imu is None
+        else imu.quat_xyzw[np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns)]
+    )
+    own, source = (float(rpy_from_quat(oriented[0])[2]), "orientation") if len(oriented) else (0.0, "")
     if gnss is None:
         return own, 0.01, source or "local frame"
     posed = np.flatnonzero(np.isfinite(gnss.quat_xyzw).all(1))[:1] if gnss.quat_xyzw is not None else np.empty(0, int)
-    fit = _fit_course(gnss, path) if path.known or not posed.size else None
+    fit = _fit_course(gnss, path) if path.is_shown else None
     if fit is not None:
         std = float(np.hypot(np.hypot(fit.yaw_std_rad, 0.03), bias_std * fit.centre_s))
         return fit.yaw_rad, min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
@@ -173,7 +156,7 @@ def _fit_course(gnss: Positions, path: _Path) -> _Fit | None:
     fixes = remove_wild_places(gnss.position_enu_m)
     noise = float(np.median(np.sqrt(gnss.variance_m2[:, :2].mean(1))))
     wanted = max(_MIN_COURSE_M, _MIN_COURSE_STD * noise)
-    drawn, turned = path.antenna(stamp_s), path.reckoned.yaw(stamp_s)
+    drawn = path.antenna(stamp_s)
     found: list[_Fit] = []
     for first in np.unique(np.searchsorted(stamp_s, np.arange(stamp_s[0], stamp_s[-1], _WINDOW_STEP_S))):
         near = slice(first, int(np.searchsorted(stamp_s, stamp_s[first] + _MAX_WINDOW_S, "right")))
@@ -181,11 +164,6 @@ def _fit_course(gnss: Positions, path: _Path) -> _Fit | None:
         if far.size == 0:
             continue
         rows = slice(first, first + int(far[0]) + 1)
-        if not path.known:  # each step between fixes goes forward, turned back by the yaw turned until then
-            if stamp_s[rows][-1] - stamp_s[first] <= wanted / MIN_SPEED_MPS:
-                back = np.exp(-0.5j * (turned[rows][1:] + turned[rows][:-1]))
-                return _Fit(float(np.angle(np.sum(np.diff(fixes[rows]) * back))), 0.2, 0.0, float(stamp_s[rows].mean()))
-            continue
         fit = _fit(fixes[rows], drawn[rows], stamp_s[rows], noise)
         if fit is not None:
             found.append(fit)
@@ -210,7 +188,7 @@ def _estimate_position(gnss: Positions | None, path: _Path, quat: Floats, yaw: f
     """Return base_link at the start and its standard deviation: the median of the first fixes less the displacement since the start."""
     if gnss is None:
         return np.zeros(3), np.full(3, 1e-3)
-    few = path.first_fixes
+    few = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 1_000_000_000, "right"), 3, 10)))
     at_s = compute_seconds(gnss.stamp_ns[few], path.start_ns)
     drawn = path.antenna(at_s, yaw)
     off = gnss.position_enu_m[few] - np.column_stack((drawn.real, drawn.imag, np.zeros(at_s.size)))
@@ -220,7 +198,8 @@ def _estimate_position(gnss: Positions | None, path: _Path, quat: Floats, yaw: f
         not gnss.has_heights
     ):  # they count from the start: kilometres of uncertainty would lean on the plane by every tilt
         std[2] = 0.0
-    return position, std + np.array([0.1, 0.1, 0.2]) * max(path.length(float(at_s[-1])), 1.0)
+    driven_m = path.reckoned.length(float(at_s[-1]))
+    return position, std + np.array([0.1, 0.1, 0.2]) * max(driven_m, 1.0) + np.ptp(off, axis=0)
 
 
 _WINDOW_NS = 500_000_000  # window of means and scatter

@@ -110,7 +110,6 @@ class BodyVelocities:
     velocity_mps : [m/s], shape (N, 3), velocity of the point at ``lever_arm_m``. Wheels: only x is measured, y and z are NaN.
     variance_m2ps2 : [m²/s²], shape (N, 3); NaN exactly where the velocity is.
     yaw_rate_radps : [rad/s], shape (N,), about base_link's z; NaN where the source gives none.
-    yaw_rate_var : [rad²/s²], shape (N,); NaN exactly where the yaw rate is.
     lever_arm_m : [m], the measured point in base_link.
     turn_rate_radps : [rad/s], shape (N, 3), about all three axes of base_link, z as in ``yaw_rate_radps``; None where the source is flat
         (wheels) or gives none.
@@ -120,7 +119,6 @@ class BodyVelocities:
     velocity_mps: NDArray[np.float64]
     variance_m2ps2: NDArray[np.float64]
     yaw_rate_radps: NDArray[np.float64]
-    yaw_rate_var: NDArray[np.float64]
     lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
     turn_rate_radps: NDArray[np.float64] | None = None
 
@@ -195,10 +193,11 @@ class Measurements:
         return self.gnss is not None and self.gnss.quat_xyzw is not None
 
     @property
-    def has_posed_tilt(self) -> bool:
-        """Whether a pose measures roll and pitch."""
+    def has_tilt(self) -> bool:
+        """Whether an IMU, a pose or a camera measures roll and pitch."""
         variance = None if self.gnss is None else self.gnss.rotation_variance_rad2
-        return variance is not None and float(variance[0, 0]) < UNMEASURED_RAD2
+        is_posed = variance is not None and float(variance[0, 0]) < UNMEASURED_RAD2
+        return is_posed or self.imu is not None or (self.visual is not None and self.visual.turn_rate_radps is not None)
 
     def odometries(self) -> dict[str, BodyVelocities]:
         """Return the odometries that are there, by role; the wheels' first."""
@@ -298,7 +297,6 @@ class Trajectory:
         its direction, the correlation of both ends counted exactly; NaN where no row stands there, and throughout in a forward filter,
         which does not know it. In between the variance may be interpolated in time, from zero at no time.
     facts : what the filter counted and settled on.
-    corrected : the measurements without what it found to be wrong with them; None: as they were.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -312,7 +310,6 @@ class Trajectory:
     rejections: Rejections
     displacement_std_m: NDArray[np.float64]
     facts: StretchFacts
-    corrected: Measurements | None = None
 
 
 PAUSE_NS = 5_000_000_000

@@ -1,13 +1,12 @@
 """Residuals of every pair of sensors over windows of several lengths, and what each density adds to their variance.
 
-A residual is the motion, or turn, by one sensor less that by another, over a window of Δ seconds: of fixes against
-an odometry along and across the heading in the window's middle, and up; of two odometries along; of two yaw rates as an angle. Its variance
-is a sum of densities times features, which are integrals over the path driven in the window:
+A residual is the motion by one sensor less that by another, over a window of Δ seconds: of fixes against an odometry along and across the
+heading in the window's middle, and up; of two odometries along. Its variance is a sum of densities times features, which are integrals
+over the path driven in the window:
 
 - fixes: white noise and Gauss-Markov processes, on each axis, also at rest;
 - an odometry: white velocity noise, and a scale as Gauss-Markov processes; a scale that all odometries share, which no pair of them shows;
-- slide: white noise of the sideways velocity; heading and pitch: Gauss-Markov errors of the direction in which an odometry is added up;
-- yaw rates: white noise, a bias and a scale as Gauss-Markov processes.
+- slide: white noise of the sideways velocity; heading and pitch: Gauss-Markov errors of the direction in which an odometry is added up.
 """
 
 from __future__ import annotations
@@ -27,15 +26,11 @@ from tcpipe.fusion.level_motion import (
     average_grid,
     compute_forward_mps,
     find_attitude,
-    find_turn_roles,
-    get_turn_rates,
     integrate_grid,
     make_free_track,
-    solve_robust,
 )
 from tcpipe.fusion.measurements import GNSS, Measurements, Positions
 from tcpipe.fusion.signals import (
-    compute_interval_means,
     compute_seconds,
     find_longest_step_ns,
     interpolate_signal,
@@ -47,11 +42,11 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-ALONG, ACROSS, UP, TURN = "along", "across", "up", "turn"
+ALONG, ACROSS, UP = "along", "across", "up"
 TIMES_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 """Time differences."""
-FIX_S, SCALE_S, TURN_S = (1.0, 3.0, 10.0, 30.0, 100.0), (3.0, 10.0, 30.0, 100.0), (10.0, 100.0)
-"""Correlation times of processes: of fixes, of scales and directions, of yaw rates."""
+FIX_S, SCALE_S = (1.0, 3.0, 10.0, 30.0, 100.0), (3.0, 10.0, 30.0, 100.0)
+"""Correlation times of processes [s]: of fixes, of scales and directions."""
 MOVING_S = (1.0, 3.0)
 """The same of errors of fixes that are there only while the robot moves."""
 
@@ -71,7 +66,7 @@ class Residuals:
     Attributes
     ----------
     start_ns, end_ns : [ns], shape (M,).
-    value : [m], turns [rad], shape (M,).
+    value : [m], shape (M,).
     features : by name of a density, its factor in the variance of each value, shape (M,).
     is_still : shape (M,), the robot is stationary throughout.
     """
@@ -130,7 +125,7 @@ def find_residuals(measurements: Measurements) -> list[Residuals]:
     rows = np.arange(0, attitude.time_s.size, round(_PAIR_STEP_S / STEP_S))
     at_ns = zero_ns + np.rint(attitude.time_s[rows] * 1e9).astype(np.int64)
     section = _Section(measurements, attitude, zero_ns, rows, at_ns)
-    residuals = _compare_turns(section)
+    residuals = list[Residuals]()
     forward = {role: compute_forward_mps(each, attitude, zero_ns) for role, each in odometries.items()}
     tracks = {} if gnss is None else align_tracks(forward, gnss, attitude, zero_ns)
     speed = np.abs(average_grid(np.column_stack([*forward.values()]), _STILL_S)).max(axis=1)
@@ -212,43 +207,6 @@ def _compare_odometries(section: _Section, pair: tuple[str, str], first: Track, 
         is_still = window.length_m < _STILL_MPS * window_s
         made.append(Residuals(pair, ALONG, window_s, at_ns[i], at_ns[j], off[j] - off[i], features, is_still))
     return made
-
-
-def _compare_turns(section: _Section) -> list[Residuals]:
-    """Return the residuals of the yaw rates of each two sensors; scale and bias of the second are fitted to the first."""
-    rows, at_ns, time_s = section.rows, section.at_ns, section.attitude.time_s
-    at_s = time_s[rows]
-    rates, sources = {}, {}
-    for role in find_turn_roles(section.measurements):
-        stamp_ns, rate = get_turn_rates(section.measurements, role)
-        middle = compute_seconds(stamp_ns, section.zero_ns)
-        means = compute_interval_means(middle, rate[:, 2:], time_s - 0.5 * STEP_S, time_s + 0.5 * STEP_S)
-        rates[role], sources[role] = means[:, 0], stamp_ns
-    made = []
-    for a, b in combinations(rates, 2):
-        turn = np.stack([integrate_grid(rates[role])[rows] for role in (a, b)], -1)
-        off = align_turns(turn, round(5.0 / _PAIR_STEP_S))
-        for window_s, i, j in section.choose_windows(at_ns, [sources[a], sources[b]]):
-            rate = _take_nodes(rates[a], at_s[i], at_s[j])
-            features = {f"{role} turn": np.full(i.size, window_s) for role in (a, b)}
-            for tau in TURN_S:
-                bias = np.full(i.size, 2.0 * tau**2 * (window_s / tau + np.expm1(-window_s / tau)))
-                scale = _integrate_process(rate, window_s, tau)
-                features |= {f"{role} bias {tau:g}": bias for role in (a, b)}
-                features |= {f"{role} turn scale {tau:g}": scale for role in (a, b)}
-            is_still = np.zeros(i.size, np.bool_)
-            made.append(Residuals((a, b), TURN, window_s, at_ns[i], at_ns[j], off[j] - off[i], features, is_still))
-    return made
-
-
-def align_turns(turn: Floats, step: int) -> Floats:
-    """Return the first of two turns (n, 2) less the second, whose scale and bias are fitted over windows of ``step`` rows."""
-    change = turn[step:] - turn[:-step]
-    if not change.size:
-        return np.asarray(turn[:, 0] - turn[:, 1])
-    matrix = np.stack((change[:, 1], np.ones(len(change))), -1)
-    found = solve_robust(matrix, change[:, 0], np.array([1.0, 0.0]), np.full(2, np.inf))
-    return np.asarray(turn[:, 0] - found[0] * turn[:, 1] - found[1] / step * np.arange(len(turn)))
 
 
 def _take_nodes(values: Floats, start_s: Floats, end_s: Floats) -> Floats:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel, Prior
 from tcpipe.fusion.filter_kernel import MOTION_WITH_GYRO, MOTION_WITHOUT_GYRO, Memory, Model
-from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements
-from tcpipe.fusion.process import find_scale_stds, is_length_observable, turn_scale_std
+from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements, Positions
+from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, is_length_observable, turn_scale_std
 from tcpipe.fusion.signals import find_chi_square_threshold
 from tcpipe.fusion.ticks import Ticks
 from tcpipe.geometry.rotation import matrix_from_quat
@@ -82,12 +82,11 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     """Return standard deviation, walk and correlation time of every error, shapes (45,): 0 where it is exact, or nothing depends on it."""
     std, walk = np.zeros(state.N), np.zeros(state.N)
     has_imu = m.imu is not None
-    has_tilt = has_imu or m.has_posed_tilt or (m.visual is not None and m.visual.turn_rate_radps is not None)
     inertial = bool((ticks.inputs.mode == state.INERTIAL).any())
     wanted = {
         "gyroscope bias": has_imu,
         "accelerometer bias": inertial,
-        "lag of fixes": m.gnss is not None and has_tilt,
+        "lag of fixes": m.gnss is not None and m.has_tilt,
         "turning centre": has_imu,
         "mounting of the IMU": inertial,
         "mounting of the camera": m.visual is not None and bool(m.visual.measured.all()),
@@ -114,12 +113,25 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     if m.gnss is not None:
         if wanted["lag of fixes"]:
             std[state.FIX_LAG] = m.gnss.lag_std_s
-        # Where roll and pitch are not known, an antenna that sways looks like one at another height; without yaw, elsewhere.
-        known = slice(0, 3 if has_tilt else 2 if m.has_attitude else 0)
-        std[state.ARM : state.ARM + 3][known] = m.gnss.lever_arm_std_m[known]
+        std[state.ARM : state.FIX_LAG] = m.gnss.lever_arm_std_m if m.has_tilt else 0.0
+        std[state.FIX_OFFSET : state.FIX_OFFSET + 3] = _find_lasting_std_m(m.gnss, m, noise)
         std[state.POSE_MOUNT : state.POSE_MOUNT + 3] = m.gnss.mounting_std_rad if m.has_attitude else 0.0
         std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
     return std, walk, time_s
+
+
+def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> Floats:
+    """Return the standard deviation of what fixes err throughout the section [m], shape (3,).
+
+    That is what fixes claim beyond the errors that the section shows; without tilt also the antenna's place, since an antenna that sways
+    looks like one elsewhere, and without heights, which show slopes, the sway.
+    """
+    axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
+    variance = np.array([max(0.0, fix.claimed_m2 - fix.white - fix.correlated.variance) for fix in axes])
+    if not m.has_tilt:
+        variance += np.square(gnss.lever_arm_std_m)
+        variance[:2] += (m.is_antenna_alone or not gnss.has_heights) * (SLOPE_RAD * gnss.lever_arm_m[2]) ** 2
+    return np.asarray(np.sqrt(variance))
 
 
 def find_walk(process: GaussMarkov | Prior) -> float:
@@ -179,12 +191,11 @@ def make_model(
     gate_probability: float,
     follows: bool = True,
     time_s: Floats | None = None,
-    ignored: Sequence[tuple[int, int, int]] = (),
     possible: Sequence[int] = (),
 ) -> Model:
     """Return the filter's model; unless it ``follows``, rejected fixes are never taken to be right after all.
 
-    ``ignored``: measurements (kind, first tick, last tick) that are not used; ``possible``: errors that other events could change.
+    ``possible``: errors that other events could change.
     """
     kept = np.ones(state.N) if time_s is None else np.exp(-period_s / time_s)
     involved = {event.place for event in events} | set(possible)
@@ -215,7 +226,6 @@ def make_model(
         events=np.array([(e.tick, position[e.place], e.is_new) for e in events], np.int64).reshape(-1, 3),
         sizes=np.array([(std[e.place] if e.is_new else e.std) ** 2 for e in events], np.float64),
         shifts=np.array([e.mean for e in events], np.float64),
-        ignored=np.array(ignored, np.int64).reshape(-1, 3),
     )
 
 
@@ -251,7 +261,7 @@ def make_start(initial: InitialState, std: Floats, arm_m: Sequence[float]) -> Me
     return Memory(x, P, np.zeros((state.KINDS, 2)))
 
 
-_START_STDS = 3.0
+_START_STDS = 5.0
 """Error of the start position, which comes from the first fixes, in standard deviations of a constant error of fixes."""
 
 
@@ -260,6 +270,6 @@ def widen_start(start: Memory, std: Floats) -> Memory:
     widened = start.copy()
     for place in range(state.FIX_ERROR, state.FIX_OFFSET + 3):
         widened.P[place, place] = std[place] ** 2
-    offset_m2 = (_START_STDS * std[state.FIX_OFFSET]) ** 2
+    offset_m2 = np.square(_START_STDS * std[state.FIX_OFFSET : state.FIX_OFFSET + 3])
     widened.P[range(state.RHO, state.RHO + 3), range(state.RHO, state.RHO + 3)] += offset_m2
     return widened

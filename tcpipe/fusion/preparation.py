@@ -4,9 +4,6 @@ Rows without a measurement (no velocity and no pose to make one from, a fix at 0
 returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is replaced by the recipe's, or by the median
 of the stated ones where that is larger; one that is too small is raised to a floor: a zero covariance is not trust. Coordinates with few
 decimals err by rounding besides.
-
-By nav_msgs/Odometry a twist is along the axes of its child frame, the robot's. Some drivers write it along those of the pose's frame, as
-the derivative of the position is: then the velocity of a robot that only drives forward turns with its yaw.
 """
 
 from __future__ import annotations
@@ -17,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.attitude import add_attitude, add_turn_variance, compute_turns
+from tcpipe.fusion.attitude import add_attitude, compute_turns
 from tcpipe.fusion.measurements import (
     IMU,
     NO_TRUST,
@@ -39,7 +36,6 @@ from tcpipe.fusion.signals import (
 )
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate
-from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
@@ -52,8 +48,6 @@ Columns = Mapping[str, Floats]
 _IMU = Subject("role", IMU)
 _QUAT = ("quat_x", "quat_y", "quat_z", "quat_w")
 _VELOCITY_FLOOR_MPS = 0.02  # no odometry is better
-_YAW_RATE_STD_RADPS = 0.1  # default of an odometry without one
-_YAW_RATE_FLOOR_RADPS = 0.02  # no odometry is better
 _MAX_VELOCITY_MPS = 50.0  # no robot is faster
 _MAX_RATE_RADPS = 100.0  # no gyroscope measures more
 _MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
@@ -65,9 +59,7 @@ _NOISE_WINDOW_NS = 2_000_000_000  # window of noise around each sample
 _MIN_COSINE = 0.1  # cosine: an unmeasured axis affects another, 6°
 _DEGREE_M = 111_320.0  # one degree of latitude, or of longitude at the equator [m]
 _SLICE_ROWS = 1 << 16
-_FEWEST = 20  # samples that show a scatter, a grid, a turn, or the axes of a twist
-_MIN_SCATTER_RATIO = 3.0  # shown over stated scatter: of counts with every other message, not of a rough road
-_MEAN_S = 0.5  # averaging of such a velocity
+_FEWEST = 20  # samples that show a grid or a turn
 _MIN_MOVING_MPS = 0.2  # a slower robot may be stationary, and its increments have no direction
 _JITTER_S = 0.05  # less does not matter
 _MIN_LATE_S, _MIN_SLOPE_S = 0.2, 1.0
@@ -218,7 +210,7 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
     variance = gnss.variance_m2.copy()
     variance[:, :2] += ((2 * np.interp(stamp_s, odometry_s, speed[:, 0]) * jitter_s) ** 2)[:, None]
     unclaimed = jitter_s > 0.0 if gnss.unclaimed is None else gnss.unclaimed | (jitter_s > 0.0)
-    return add_turn_variance(replace(gnss, variance_m2=variance, unclaimed=unclaimed), 2 * jitter_s), jitter_s
+    return replace(gnss, variance_m2=variance, unclaimed=unclaimed), jitter_s
 
 
 def inflate_late_fixes(gnss: Positions, late_s: float) -> Positions:
@@ -270,8 +262,8 @@ def prepare_body_velocities(
     """Prepare an odometry (columns of the roles wheel_odometry and visual_odometry), whose child frame has the extrinsics given.
 
     Its twist is used where it has one. One that has no forward velocity, or is zero throughout while the poses move, is none: the velocity
-    is then that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. One that is
-    clearly along the axes of the pose's frame is turned by the pose. Of wheels ``only_forward`` velocity, along base_link's x, is measured.
+    is then that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. Of wheels
+    ``only_forward`` velocity, along base_link's x, is measured.
     """
     pose = _stack_columns(columns, ("x_m", "y_m", "z_m"))
     velocity = _stack_columns(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
@@ -284,13 +276,8 @@ def prepare_body_velocities(
     if not has_twist(_rotate_vectors(rotation, velocity)[:, :1], pose):
         stamp_ns, velocity, rate = compute_increments(stamp_ns, pose, quat)
         variance = np.full_like(velocity, np.nan)
-        yaw_rate_var = np.full(stamp_ns.size, np.nan)
         findings.append(make_finding("pose-increments", subject))
     else:
-        yaw_rate_var = columns["yaw_rate_var"]
-        if is_along_pose_axes(stamp_ns, velocity, pose, quat):
-            velocity = rotate_to_child_axes(velocity, quat)
-            findings.append(make_finding("twist-in-pose-frame", subject))
         rates, of_orientation = compute_orientation_rates(stamp_ns, rate, quat)
         if of_orientation[2] or not only_forward:
             rate = rates
@@ -304,43 +291,19 @@ def prepare_body_velocities(
     variance[np.isnan(turned)] = NO_TRUST
     variance, replaced = _clean_variances(variance, np.full(3, default_std_mps**2), _VELOCITY_FLOOR_MPS**2)
     turn_rate = _rotate_vectors(rotation, rate)[usable]
-    yaw_rate = turn_rate[:, 2]
-    floor = _YAW_RATE_FLOOR_RADPS**2
-    yaw_rate_var = _clean_variances(yaw_rate_var[usable, None], np.array([_YAW_RATE_STD_RADPS**2]), floor)[0][:, 0]
-    yaw_rate_var = np.maximum(yaw_rate_var, _estimate_shown_variance(stamp_ns[usable], yaw_rate, yaw_rate_var))
-    shown = _estimate_shown_variance(stamp_ns[usable], turned[:, 0], variance[:, 0])
-    if shown.any():
-        variance = np.maximum(variance, shown[:, None])
-        turned = compute_window_means(stamp_ns[usable], turned, stamp_ns[usable], round(1e9 * _MEAN_S))
-        findings.append(make_finding("velocity-scatters", subject, mean_s=_MEAN_S))
     if only_forward:
         turned[:, 1:] = np.nan
         variance[:, 1:] = np.nan
     else:  # an axis that is not measured is zero, to within anything
         turned[np.isnan(turned)] = 0.0
-    yaw_rate_var[~np.isfinite(yaw_rate)] = np.nan
     spatial = None if only_forward or not np.isfinite(turn_rate).all() else turn_rate
-    made = BodyVelocities(stamp_ns[usable], turned, variance, yaw_rate, yaw_rate_var, xyz_m, spatial)
+    made = BodyVelocities(stamp_ns[usable], turned, variance, turn_rate[:, 2], xyz_m, spatial)
     return made, Prepared(stamp_ns[~measured], repeated, replaced, tuple(findings))
 
 
 def _find_orientation_rates(of_orientation: Mask, subject: Subject) -> list[Finding]:
     axes = ", ".join(np.array(["x", "y", "z"])[of_orientation])
     return [make_finding("rate-from-orientation", subject, names={"axes": axes})] if axes else []
-
-
-def _estimate_shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -> Floats:
-    """Return the variance that samples (N,) show around each where they mostly scatter by much more than is claimed; zeros elsewhere."""
-    known = np.flatnonzero(np.isfinite(values))
-    second = np.abs(np.diff(values[known], n=2))
-    moving = second > 0.0
-    shown = np.zeros(values.size)
-    if moving.sum() < _FEWEST:
-        return shown
-    noise = estimate_robust_std(second[moving]) / np.sqrt(6.0)
-    if noise > _MIN_SCATTER_RATIO * float(np.sqrt(np.median(variance[known]))):
-        shown[known] = np.square(_estimate_local_noise(stamp_ns[known], values[known, None]))
-    return shown
 
 
 def _rotate_vectors(matrix: Floats, values: Floats) -> Floats:
@@ -463,7 +426,6 @@ def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[F
 
 _MAX_INCREMENT_S = 1.0  # longer increments give no velocity
 _MIN_MOVED_M = 0.1  # smaller moves may be stationary
-_MAX_MISFIT, _MIN_MISFIT = 0.1, 0.3  # largest residual share along its axes (18°); smallest along other axes (33°)
 _MIN_TURNED_RAD = 0.2  # a larger turn contradicts a zero rate
 
 
@@ -510,32 +472,3 @@ def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Flo
     rates = np.where(turns, np.nan, rate_radps)
     rates[inner[near]] = np.where(turns, rate[near], rate_radps[inner[near]])
     return rates, turns
-
-
-def is_along_pose_axes(stamp_ns: Ints, velocity_mps: Floats, pose_m: Floats, quat_xyzw: Floats) -> bool:
-    """Return whether velocities are clearly along the axes of the pose's frame: its increments fit them so, and not turned by the pose.
-
-    Velocities [m/s] have shape (N, 3), NaN where an axis is not measured.
-    """
-    known = np.isfinite(np.hstack((velocity_mps[:, :2], pose_m, quat_xyzw))).all(1)
-    step_s = np.diff(stamp_ns[known])[:, None] * 1e-9
-    good = ((step_s > 0) & (step_s <= _MAX_INCREMENT_S))[:, 0]
-    way = np.diff(pose_m[known, :2], axis=0)[good] / step_s[good]
-    size = np.linalg.norm(way, axis=1)
-    moving = size > _MIN_MOVING_MPS
-    if moving.sum() < _FEWEST:
-        return False
-    measured, misfit = np.nan_to_num(velocity_mps[known]), []
-    for axes in (measured, rotate(quat_xyzw[known], measured)):
-        velocity = ((axes[1:] + axes[:-1])[good, :2] / 2.0)[moving]
-        scale = np.median(np.linalg.norm(velocity, axis=1) / size[moving])
-        rest = np.sum((velocity - scale * way[moving]) ** 2, axis=1) / (scale * size[moving]) ** 2
-        misfit.append(np.median(rest))  # poses may jump
-    return bool(misfit[0] < _MAX_MISFIT and misfit[1] > _MIN_MISFIT)
-
-
-def rotate_to_child_axes(velocity_mps: Floats, quat_xyzw: Floats) -> Floats:
-    """Return velocities (N, 3) that are along the pose's axes along those of the child frame; NaN where the pose is none."""
-    turned = rotate(invert(quat_xyzw), np.nan_to_num(velocity_mps))
-    turned[np.isnan(velocity_mps)] = np.nan
-    return np.where(np.isfinite(quat_xyzw).all(1, keepdims=True), turned, np.nan)

@@ -26,7 +26,6 @@ from tcpipe.fusion.measurements import (
 from tcpipe.fusion.signals import (
     MAX_ACCELERATION_MPS2,
     compute_median_period_ns,
-    compute_running_median,
     compute_slopes,
     is_covered,
     remove_wild_places,
@@ -53,7 +52,7 @@ UNSEEN_TURN_RADPS = 0.07  # roll and pitch rate on uneven ground [rad/s], 1σ
 GROUND = 2e-3  # density of the change of slope under a robot [rad²/m]: 2.6° over a metre
 _ACCELERATION_WINDOW_S = 0.6  # window of an odometry's slope [s]
 _ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration [s]: one row
-_COURSE_DENSITY = 0.02  # density of turns that only the course over ground shows [rad²/s]: 8° in a second
+_COURSE_DENSITY = 5e-3  # density of turns that only the course over ground shows [rad²/s]: 4° in a second
 _MIN_TURN_DENSITY = 5e-7  # least density of turns [rad²/s]: a tenth of a degree in a second
 _MIN_DENSITY = 1e-4  # least density of velocity [m²/s³]: 1 cm/s in a second, forward and aside
 _SLIDE_DENSITY = 4e-4  # density of sliding that no camera shows [m²/s³]
@@ -61,14 +60,8 @@ _UNKNOWN_DENSITY = 0.3  # density of velocity that no sensor shows [m²/s³]
 _FIXES, _WINDOW_S = 5, 1.0  # fewest fixes [1], and shortest time [s], that show a velocity or a slide
 _UNSEEN_LASTS_S = 0.2  # correlation time of an acceleration that a fast receiver shows [s]
 _UNSEEN_MPS2 = 0.07  # acceleration between two measurements of a receiver [m/s²], 1σ
-_MAX_COURSE_MPS = 0.2  # largest σ of a velocity by fixes that shows a course [m/s]
 _UNSEEN_MPS = 0.5  # σ of a velocity by fixes above which they do not show its change [m/s]
 _SHOWN_MPS2 = 0.15  # σ of an acceleration by a receiver [m/s²]: half of the change that masks look for
-_LEVEL_STD_RAD = 0.7  # roll and pitch without an accelerometer [rad], 1σ
-_COURSE_ROLL_STD_RAD = 0.05  # roll where only the course gives turns [rad], 1σ
-_CHORD_S, _CHORD_M = 4.0, 1.0  # baseline of a slope by fixes [s], and its least length [m]
-_MAX_SLOPE_RAD = 0.6  # steepest slope that a robot climbs [rad]
-_SLOPE_LASTS_M = 10.0  # length of one slope [m]
 
 
 def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
@@ -76,58 +69,9 @@ def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
     return [source for source in measurements.odometries().values() if np.isfinite(source.yaw_rate_radps).any()]
 
 
-def is_gliding(measurements: Measurements) -> bool:
-    """Return whether positions are all there is, too noisy to show a course.
-
-    The velocity then strays over ground, and which way the body looks is not asked.
-    """
-    if measurements.gnss is None or not measurements.is_antenna_alone:
-        return False
-    return _compute_fix_velocity_std_mps(measurements.gnss) > _MAX_COURSE_MPS
-
-
-def is_turned_by_course(measurements: Measurements) -> bool:
-    """Return whether only the course over ground shows how the robot turns."""
-    has_turn_sensor = measurements.imu is not None or turn_sources(measurements)
-    return not has_turn_sensor and measurements.gnss is not None and not is_gliding(measurements)
-
-
-def _compute_fix_velocity_std_mps(gnss: Positions) -> float:
-    """Return the σ of the slope of a line through the fixes of a second [m/s], five at least."""
-    period_s = 1e-9 * compute_median_period_ns(gnss.stamp_ns)
-    window_s = max(_WINDOW_S, _FIXES * period_s)
-    return float(np.sqrt(12.0 * period_s / window_s * np.median(gnss.variance_m2[:, :2]))) / window_s
-
-
-def estimate_slope_std_rad(measurements: Measurements) -> float | None:
-    """Return how steep the ground is by how fixes climb it [rad], root mean square; None where they are too few or too noisy.
-
-    It is as steep across as along. One standard deviation of an estimate by a few slopes, which last for some metres, is added.
-    """
-    gnss = measurements.gnss
-    if gnss is None or gnss.stamp_ns.size < _FIXES:
-        return None
-    rows = max(1, round(_CHORD_S * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
-    place_m = np.stack([compute_running_median(axis) for axis in gnss.position_enu_m.T])
-    east, north, up = place_m[:, rows:] - place_m[:, :-rows]
-    way_m = np.hypot(east, north)
-    climbs = way_m > _CHORD_M
-    if climbs.sum() < _FIXES:
-        return None
-    slope = (up / np.maximum(way_m, _CHORD_M))[climbs].clip(-_MAX_SLOPE_RAD, _MAX_SLOPE_RAD)
-    noise = float(2.0 * np.median(gnss.variance_m2[:, 2]) / np.median(way_m[climbs]) ** 2)
-    excess = float(np.mean(slope**2)) - noise
-    slopes_seen = max(1.0, float(np.sum(way_m[climbs])) / rows / _SLOPE_LASTS_M)
-    return float(np.sqrt(excess)) * (1.0 + float(np.sqrt(0.5 / slopes_seen))) if excess > noise else None
-
-
-def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
-    """Return the standard deviations of a pitch and roll of zero, once a second, where no accelerometer measures them.
-
-    Where only the course shows turns, sway of the antenna would look like roll, so that roll has a small standard deviation.
-    """
-    is_held = is_turned_by_course(measurements) and not measurements.has_posed_tilt
-    return _LEVEL_STD_RAD, _COURSE_ROLL_STD_RAD if is_held else _LEVEL_STD_RAD
+def is_turned_by_course(m: Measurements) -> bool:
+    """Return whether only the course over ground shows how the robot turns: fixes, and odometry without a yaw rate."""
+    return m.gnss is not None and m.imu is None and bool(m.odometries()) and not turn_sources(m)
 
 
 def turn_scale_std(measurements: Measurements) -> float:
@@ -210,7 +154,7 @@ def _make_turn_density(
     The scale of an odometry's turn rate is off by the variation of `PRIORS` for a second at a time, beside what is constant of it.
     """
     density = np.full((mode.size, 3), _MIN_TURN_DENSITY)
-    ground = np.full(mode.size, 0.0 if is_gliding(m) else GROUND)
+    ground = np.full(mode.size, 0.0 if m.is_antenna_alone else GROUND)
     if is_turned_by_course(m):
         density[:, 2] = _COURSE_DENSITY
     for role in noise.turns.keys() - {IMU}:
@@ -255,7 +199,8 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     period_s = 1e-9 * compute_median_period_ns(source.stamp_ns)
     if isinstance(source, Positions):
         std, order = float(np.sqrt(np.median(source.variance_m2[:, :2]))), 2
-        least = _UNKNOWN_DENSITY * min(1.0, (_compute_fix_velocity_std_mps(source) / _UNSEEN_MPS) ** 2)
+        velocity_std_mps = np.sqrt(12.0 / _FIXES) * std / max(_WINDOW_S, _FIXES * period_s)
+        least = _UNKNOWN_DENSITY * min(1.0, (velocity_std_mps / _UNSEEN_MPS) ** 2)
         places = remove_wild_places(source.position_enu_m)
         axes = [places.real, places.imag]
     else:

@@ -126,8 +126,7 @@ def step_before_update(
             for i in range(n):
                 rows[r, i] -= H[a, i] * f
     for a in range(size):  # B = K' Λ
-        for j in range(n):
-            B[a, j] = 0.0
+        B[a, :n] = 0.0
         for i in range(n):
             f = K[a, i]
             for j in range(n):
@@ -160,11 +159,9 @@ def step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint
     for i in range(n):
         f = kept[i]
         if f != 1.0:
-            for j in range(n):
-                information[i, j] *= f
-                information[j, i] *= f
-            for r in range(rows.shape[0]):
-                rows[r, i] *= f
+            information[i] *= f
+            information[:, i] *= f
+            rows[:, i] *= f
     for r in range(rows.shape[0]):
         for a in range(m):
             W[0, a] = rows[r, places[a]]
@@ -174,17 +171,14 @@ def step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint
                 s += F[a, b] * W[0, a]
             rows[r, places[b]] = s
     for _ in range(2):  # F' from the left, twice: Λ is symmetric
-        for b in range(m):
-            for j in range(n):
-                W[b, j] = 0.0
+        W[:m] = 0.0
         for a in range(m):
             for b in range(m):
                 f = F[a, b]
                 for j in range(n):
                     W[b, j] += f * information[places[a], j]
         for b in range(m):
-            for j in range(n):
-                information[places[b], j] = W[b, j]
+            information[places[b]] = W[b]
         for i in range(n):
             for j in range(i):
                 s = information[i, j]
@@ -204,8 +198,7 @@ def _smooth_tick(
     information, rows, ticks, ends, near = adjoint
     d, turn, c, after = room
     n = P.shape[0]
-    for e in range(N):
-        d[e] = 0.0
+    d[:] = 0.0
     for i in range(n):
         s = 0.0
         for j in range(n):
@@ -217,8 +210,7 @@ def _smooth_tick(
     for i in range(n):
         if i >= count and not model.mount <= i < model.mount + 3:
             continue
-        for j in range(n):
-            A[i, j] = 0.0
+        A[i] = 0.0
         for b in range(n):
             f = P[i, b]
             for j in range(n):
@@ -289,8 +281,8 @@ def _smooth_tick(
                     for j in range(3):
                         s += x[3 * axis + i] * x[3 * b + j] * c[RHO + i, RHO + j]
                 ends[q, 2 + axis + b] = s
+            after[:] = 0.0
             for j in range(n):
-                after[j] = 0.0
                 for i in range(3):
                     after[j] += P[RHO + i, j] * x[3 * axis + i]
             for i in range(n):

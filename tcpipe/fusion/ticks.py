@@ -20,12 +20,11 @@ from tcpipe.fusion import state
 from tcpipe.fusion.dead_reckoning import compute_course_rate
 from tcpipe.fusion.densities import DETERMINED, NoiseModel
 from tcpipe.fusion.filter_kernel import Inputs, Memory, Model, Tests
-from tcpipe.fusion.measurements import NO_LEVER_ARM, VISUAL, WHEELS, BodyVelocities, Measurements
+from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import (
     DOPPLER_LASTS_S,
     UNSEEN_TURN_RADPS,
-    is_gliding,
-    level_stds_rad,
+    is_turned_by_course,
     make_motion_noise,
     turn_sources,
 )
@@ -47,14 +46,14 @@ _LONGEST_NS = 50_000_000
 _STATIONARY_EVERY_S = 0.2
 _STATIONARY_STD_MPS = 0.01  # a robot that stands rocks
 _STATIONARY_RATE_STD_RADPS = 5e-4
-_LEVEL_EVERY_S = 1.0
+_LEVEL_EVERY_S, _LEVEL_STD_RAD = 1.0, 0.7
+"""Time between roll and pitch of zero without an accelerometer [s], and their σ [rad]."""
 _UNMEASURED = 1e6  # m²/s²
 _LEAST_M2PS = 4e-6  # 2 mm after a second: the mean of a tick is no better than that
 _MOVING_MPS = 0.05  # slower is stationary (ruling)
 _ACCELERATION_WINDOW_S = 0.4
 # Sideways velocities are independent after this time: what lasts longer of them is in the states of turning centre and mounting.
 _SLIDE_LASTS_S = 0.016
-_SWAY_LASTS_S = 0.5  # an antenna that is base_link itself sways, and is not where the robot turns
 _LASTING_S = 0.1  # errors of an odometry beyond its white noise are independent after this time
 
 
@@ -147,7 +146,7 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
     if m.gnss is not None and m.doppler is not None:
         lasting = max(1.0, DOPPLER_LASTS_S * 1e9 / compute_median_period_ns(m.doppler.stamp_ns))
         variances = m.doppler.variance_m2ps2 * lasting
-        if m.imu is None and (m.visual is None or m.visual.turn_rate_radps is None):
+        if not m.has_tilt:
             variances = variances + _compute_unseen_turn_variance(m.doppler.stamp_ns, m.gnss.lever_arm_m)
         put(state.DOPPLER, m.doppler.stamp_ns, m.doppler.velocity_enu_mps, variances)
     _add_constraints(m, stationary_ns, stamp_ns, value, variance, period_s=period_s)
@@ -242,17 +241,15 @@ def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, floa
 def _add_constraints(
     m: Measurements, stationary_ns: Ints, stamp_ns: Ints, value: Floats, variance: Floats, *, period_s: float
 ) -> None:
-    if is_gliding(m):  # which way the body looks is not known
+    if m.is_antenna_alone:  # which way the body looks is not known
         return
     value[:, state.SIDEWAYS, :2] = 0.0
-    is_base = m.gnss is not None and m.is_antenna_alone and m.gnss.lever_arm_std_m == NO_LEVER_ARM
-    slide_lasts_s = _SWAY_LASTS_S if is_base else _SLIDE_LASTS_S
-    variance[:, state.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * slide_lasts_s / period_s
+    variance[:, state.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * _SLIDE_LASTS_S / period_s
     imu = m.imu
     if imu is None or not imu.accelerometer_usable:
         every = max(1, round(_LEVEL_EVERY_S / period_s))
         value[::every, state.LEVEL, :2] = 0.0
-        variance[::every, state.LEVEL, :2] = np.square(level_stds_rad(m))
+        variance[::every, state.LEVEL, :2] = _LEVEL_STD_RAD**2
     if imu is None or not stationary_ns.size:
         return
     inside = np.zeros(stamp_ns.size, np.bool_)
@@ -349,15 +346,14 @@ def _find_turn_rates(m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: 
 def _compute_odometric_turn_rate(
     m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int
 ) -> tuple[Floats, NDArray[np.int8]]:
-    """Return the mean angular velocity by the odometries, shape (K, 3), and the mode; by the course over ground where there are none."""
+    """Return the mean angular velocity by the odometries, shape (K, 3), and the mode; by the course over ground where it alone shows it."""
     rate = np.zeros((before_ns.size, 3))
     mode = np.full(before_ns.size, state.FLAT_TURN, np.int8)
     start_s, end_s = compute_seconds(before_ns, zero_ns), compute_seconds(after_ns, zero_ns)
-    sources = turn_sources(m)
-    if not sources and m.gnss is not None and not is_gliding(m):
+    if m.gnss is not None and is_turned_by_course(m):
         stamp_s, values = compute_course_rate(m.gnss, m.first_odometry, zero_ns)
         rate[:, 2] = compute_interval_means(stamp_s, values[:, None], start_s, end_s)[:, 0]
-    for rank, source in enumerate(sources):
+    for rank, source in enumerate(turn_sources(m)):
         known = np.isfinite(source.yaw_rate_radps)
         turns = source.turn_rate_radps
         values = np.stack((0 * source.yaw_rate_radps,) * 2 + (source.yaw_rate_radps,), -1) if turns is None else turns

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import state
 from tcpipe.fusion.changes import Hypothesis
-from tcpipe.fusion.error_state import make_trajectory, prepare_section
+from tcpipe.fusion.error_state import make_tests, make_trajectory, prepare_section
 from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Memory, Model
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S, InitialState, Measurements, Trajectory
-from tcpipe.fusion.passes import make_tests
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed
 from tcpipe.fusion.ticks import Pass, Ticks
 

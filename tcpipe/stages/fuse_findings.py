@@ -190,7 +190,6 @@ CHANGES = {
     "scale": "its scale changed by {:.0%}",
     "frame": "the frame of its attitude turned by {:.2f} rad",
     "pose": "its clock stepped, or the robot was moved by {:.1f} m without being measured",
-    "useless": "it measured nothing usable",
 }
 """Changes in words, with their size."""
 

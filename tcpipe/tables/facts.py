@@ -117,11 +117,10 @@ class ParameterFacts:
 class NoiseFacts:
     """σ of the change of a sensor's error over each of ``time_s`` [s], as fitted to the section, and by its covariances alone.
 
-    ``unit``: m (of fixes along one axis, of the distance of an odometry at its median speed) or rad (of a turn). ``data_share``: the
-    share of the fitted variance that the data determine; the rest is what is known beforehand.
+    [m], of fixes along one axis, of the distance of an odometry at its median speed. ``data_share``: the share of the fitted variance that
+    the data determine; the rest is what is known beforehand.
     """
 
-    unit: str
     time_s: tuple[float, ...]
     std: tuple[float, ...]
     claimed_std: tuple[float, ...]
@@ -142,8 +141,6 @@ class StretchFacts:
     common_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     """σ of the unobservable common odometry scale, included in σ of distances, speeds and labels."""
     changes: tuple[ChangeFacts, ...] = field(default=(), metadata=LEFT_OUT)
-    rival_change_count: int = field(default=0, metadata=LEFT_OUT)
-    """Number of changes of a set that explains the sensors clearly better than those believed."""
     parameters: Mapping[str, ParameterFacts] = field(default_factory=dict, metadata=LEFT_OUT)
     noise: Mapping[str, NoiseFacts] = field(default_factory=dict, metadata=LEFT_OUT)
     clock_epoch: int = 0
@@ -162,7 +159,7 @@ class StretchFacts:
 
     def count_changes(self) -> int:
         """Return the number of changes that explain the sensors, without `FIX_ERRORS`, which only make the position uncertain."""
-        return max(self.rival_change_count, sum(each.kind not in FIX_ERRORS for each in self.changes))
+        return sum(each.kind not in FIX_ERRORS for each in self.changes)
 
 
 @dataclass(frozen=True, slots=True)

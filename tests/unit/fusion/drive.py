@@ -149,7 +149,6 @@ def measure(
             np.column_stack((v, nothing, nothing)),
             np.column_stack((np.full(t.size, 0.03**2), nothing, nothing)),
             yaw_rate,
-            np.full(t.size, 0.05**2),
         )
     if visual:
         t = stamps(30.0)
@@ -159,7 +158,7 @@ def measure(
         wild = rng.random(t.size) < 0.01
         v[wild] += rng.normal(size=(wild.sum(), 3)) * 0.7
         nothing = np.full(t.size, np.nan)
-        found["visual"] = BodyVelocities(ns(t), v, np.full((t.size, 3), 0.03**2), nothing, nothing, tuple(lever))
+        found["visual"] = BodyVelocities(ns(t), v, np.full((t.size, 3), 0.03**2), nothing, tuple(lever))
     if imu:
         t = stamps(imu_hz)
         walk = np.cumsum(rng.normal(size=(t.size, 3)), axis=0) * np.sqrt(1 / imu_hz)

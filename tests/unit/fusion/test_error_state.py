@@ -12,8 +12,7 @@ from tcpipe.errors import FusionError
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import GNSS, NO_TRUST, VISUAL, WHEELS, BodyVelocities, Measurements
-from tcpipe.fusion.process import SCALE_STD, estimate_slope_std_rad
-from tcpipe.geometry.rotation import matrix_from_quat
+from tcpipe.fusion.process import SCALE_STD
 
 PERIOD_NS = 50_000_000
 
@@ -127,7 +126,7 @@ def test_fixes_without_heights_measure_the_plane(others):
     found = fuse(replace(m, gnss=flat))
     at_s = (found.stamp_ns - drive.ZERO_NS) * 1e-9
     off_m = np.hypot(*(found.position_enu_m - truth().at(truth().position, at_s))[:, :2].T)
-    assert np.sqrt(np.mean(off_m**2)) < 1.5 * np.sqrt(np.mean(np.sum(found.position_std_m[:, :2] ** 2, axis=1))) < 0.3
+    assert np.sqrt(np.mean(off_m**2)) < 1.6 * np.sqrt(np.mean(np.sum(found.position_std_m[:, :2] ** 2, axis=1))) < 0.3
     assert found.position_std_m[:, 2].min() >= 1000.0
 
 
@@ -184,19 +183,12 @@ def test_without_gnss_a_metre_of_the_wheels_stays_one(kept):
 def test_a_speed_without_a_yaw_rate_goes_where_the_fixes_go():
     measurements = drive.measure(truth(), 1, imu=False, visual=False, gnss_std=0.05)
     nothing = np.full_like(measurements.wheels.yaw_rate_radps, np.nan)
-    speed_only = replace(measurements.wheels, yaw_rate_radps=nothing, yaw_rate_var=nothing)
+    speed_only = replace(measurements.wheels, yaw_rate_radps=nothing)
     found = fuse(replace(measurements, wheels=speed_only))
     figures = drive.errors(truth(), found)
-    assert figures["xy"] < 0.3
-    assert figures["forward"] < 0.1
-    assert figures["nees_position"] < 4.0
-    # The course takes a roll for a turn: across the way nobody knows where below its antenna the robot is.
-    rotation = matrix_from_quat(found.quat_xyzw)
-    across = np.sqrt(np.sum((rotation[:, :2, 1] * found.position_std_m[:, :2]) ** 2, axis=1))
-    slope = estimate_slope_std_rad(measurements)
-    assert slope is not None
-    sway_m = slope * abs(measurements.gnss.lever_arm_m[2])
-    assert (across > sway_m * (1.0 - rotation[:, 2, 1] ** 2) / np.sqrt(2.0)).all()
+    assert figures["xy"] < 0.12
+    assert figures["forward"] < 0.02
+    assert figures["nees_position"] < 3.0
 
 
 def test_noisy_fixes_alone_say_that_they_hardly_tell_a_speed():
@@ -264,7 +256,7 @@ def test_a_track_of_wheels_alone_is_as_long_as_they_say(hills, within):
     velocity, variance = three.copy(), three.copy()
     velocity[:, 0], variance[:, 0] = speed + 0.01 * noise[:, 0], 0.03**2
     rate = turn * np.cos(climb) * (speed > 0) + 0.01 * noise[:, 1]
-    wheels = BodyVelocities(stamp_ns, velocity, variance, rate, np.full(s.size, 0.05**2))
+    wheels = BodyVelocities(stamp_ns, velocity, variance, rate)
     found = fuse(Measurements(wheels=wheels))
     driven_m = np.sum(np.linalg.norm(np.diff(found.position_enu_m, axis=0), axis=1))
     own_m = drive.integral(stamp_ns, speed)[-1]

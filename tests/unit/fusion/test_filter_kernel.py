@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from unit.fusion import se3_reference as reference
 
-from tcpipe.fusion import passes, smoother_kernel, state
+from tcpipe.fusion import error_state, smoother_kernel, state
+from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
 from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Inputs, Memory, allocate_steps, filter_ticks
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
-from tcpipe.fusion.passes import filter_section, make_tests, smooth_section
 from tcpipe.fusion.smoother_kernel import (
     FAR_EVERY,
     NEAR_EVERY,
@@ -279,7 +279,7 @@ class Problem:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_filter_and_smoother_solve_the_least_squares_problem_of_all_ticks(monkeypatch, mode):
-    monkeypatch.setattr(passes, "_BLOCK", 17)
+    monkeypatch.setattr(error_state, "_BLOCK", 17)
     monkeypatch.setattr(smoother_kernel, "NEAR", 20)
     problem = Problem(11, mode)
     found = problem.smooth()

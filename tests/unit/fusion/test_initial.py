@@ -97,7 +97,7 @@ def test_a_robot_that_starts_on_a_slope_rises_or_falls_with_it(slope_rad):
     imu = InertialMeasurements(stamp_ns, np.zeros((n, 3)), force, np.full((n, 4), np.nan), 0.003, 0.1)
     only_x = np.column_stack((np.ones(n // 2), np.full((n // 2, 2), np.nan)))
     unknown = np.full(n // 2, np.nan)
-    wheels = BodyVelocities(stamp_ns[::2], only_x, 1e-4 * only_x, unknown, unknown)
+    wheels = BodyVelocities(stamp_ns[::2], only_x, 1e-4 * only_x, unknown)
     fix_ns = stamp_ns[::10]
     fixes = Positions(fix_ns, np.outer(fix_ns * 1e-9, along), np.full((fix_ns.size, 3), 1e-4))
     initial = start_of(Measurements(gnss=fixes, imu=imu, wheels=wheels))

@@ -1,13 +1,11 @@
-"""Along whose axes a twist is, told by the poses beside it: drives written down by formula."""
+"""Velocities and rates from poses: drives written down by formula."""
 
 import numpy as np
 import pytest
 
 from tcpipe.fusion.preparation import (
     compute_orientation_rates,
-    is_along_pose_axes,
     prepare_body_velocities,
-    rotate_to_child_axes,
 )
 from tcpipe.geometry.rotation import quat_from_rpy
 
@@ -29,45 +27,6 @@ def circle(rate=RATE, start_rad=0.4):
 
 def quats(yaw):
     return quat_from_rpy(np.zeros(T.size), np.zeros(T.size), yaw)
-
-
-def test_a_velocity_that_turns_round_with_the_path_is_along_the_poses_axes_and_turned():
-    yaw, place, along = circle()
-    assert is_along_pose_axes(STAMP_NS, along, place, quats(yaw))
-    assert rotate_to_child_axes(along, quats(yaw)) == pytest.approx(np.tile([SPEED, 0.0, 0.0], (T.size, 1)), abs=1e-9)
-
-
-@pytest.mark.parametrize("scale", [0.7, 1.4])
-def test_a_velocity_of_another_scale_is_turned_as_well(scale):
-    yaw, place, along = circle()
-    assert is_along_pose_axes(STAMP_NS, scale * along, place, quats(yaw))
-
-
-def test_a_velocity_along_the_robots_axes_is_left():
-    yaw, place, _ = circle()
-    assert not is_along_pose_axes(STAMP_NS, np.tile([SPEED, 0.0, 0.0], (T.size, 1)), place, quats(yaw))
-
-
-def test_straight_along_the_first_axis_both_are_the_same_and_nothing_is_turned():
-    yaw, place, along = circle(rate=0.0, start_rad=0.0)
-    assert not is_along_pose_axes(STAMP_NS, along, place, quats(yaw))
-
-
-def test_an_odometry_without_poses_or_with_one_axis_is_left():
-    yaw, place, along = circle()
-    assert not is_along_pose_axes(STAMP_NS, along, np.full_like(place, np.nan), quats(yaw))
-    along[:, 1] = np.nan
-    assert not is_along_pose_axes(STAMP_NS, along, place, quats(yaw))
-
-
-def test_such_an_odometry_is_prepared_as_driving_forward_and_it_is_said():
-    yaw, place, along = circle()
-    columns = odometry(along[:, 0], yaw, np.full(T.size, RATE))
-    columns |= {f"velocity_{axis}_mps": along[:, k] for k, axis in enumerate("xyz")}
-    columns |= {f"{axis}_m": place[:, k] for k, axis in enumerate("xyz")}
-    made, prepared = twists(columns)
-    assert made.velocity_mps[:, 0] == pytest.approx(np.full(T.size, SPEED))
-    assert prepared.findings[0].code == "twist-in-pose-frame"
 
 
 @pytest.mark.parametrize("silent", [0.0, np.nan])
@@ -120,20 +79,6 @@ def test_an_odometry_without_a_turn_rate_turns_with_its_orientation():
     assert made.yaw_rate_radps[1:-1] == pytest.approx(RATE)
     (finding,) = prepared.findings
     assert (finding.code, finding.names) == ("rate-from-orientation", {"axes": "z"})
-
-
-def test_counts_that_come_with_every_other_message_are_averaged_and_as_uncertain_as_they_scatter():
-    yaw, _, _ = circle()
-    speed = np.where(np.arange(T.size) % 2, 2.0 * SPEED, 0.0)
-    made, prepared = twists(odometry(speed, yaw, np.full(T.size, RATE)))
-    assert made.velocity_mps[5:-5, 0] == pytest.approx(SPEED, rel=0.25)
-    assert made.velocity_mps[5:-5, 0].mean() == pytest.approx(SPEED, rel=0.01)
-    assert (made.variance_m2ps2[5:-5, 0] > 1.0).all()
-    assert "velocity-scatters" in {of.code for of in prepared.findings}
-    noisy = SPEED + 0.05 * np.random.default_rng(1).standard_normal(T.size)
-    made, prepared = twists(odometry(noisy, yaw, np.full(T.size, RATE)))
-    assert (made.velocity_mps[:, 0] == noisy).all()
-    assert not prepared.findings
 
 
 def test_a_twist_that_tells_no_forward_velocity_is_none_where_the_poses_move():

@@ -101,7 +101,7 @@ def test_wheels_of_any_rate_carry_the_information_of_their_noise_density(hz):
     m = drive.measure(drive.make_drive(20.0), 2)
     stamp_ns, density = drive.ns(np.arange(0.2, 19.0, 1.0 / hz)), 2e-3  # m²/s
     steady = np.column_stack((np.ones(stamp_ns.size), np.full((stamp_ns.size, 2), np.nan)))
-    source = BodyVelocities(stamp_ns, steady, 1e-6 * steady, steady[:, 1], steady[:, 1])
+    source = BodyVelocities(stamp_ns, steady, 1e-6 * steady, steady[:, 1])
     fitted = drive.estimate_noise(m)
     odometry = replace(fitted.odometries[WHEELS], white=density, white_data_share=1.0)
     noise = replace(fitted, odometries={**fitted.odometries, WHEELS: odometry})
@@ -215,7 +215,7 @@ S = 1_000_000_000
 
 def wheels(stamp):
     three = np.zeros((stamp.size, 3))
-    return BodyVelocities(stamp, three, three + 1, three[:, 0], three[:, 0] + 1)
+    return BodyVelocities(stamp, three, three + 1, three[:, 0])
 
 
 def imu(stamp):

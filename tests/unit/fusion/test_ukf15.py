@@ -9,11 +9,11 @@ from unit.fusion import se3_reference as reference
 
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import fit_noise
+from tcpipe.fusion.error_state import make_tests
 from tcpipe.fusion.filter_kernel import allocate_steps, filter_ticks
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import make_model, make_priors, make_start
-from tcpipe.fusion.passes import make_tests
 from tcpipe.fusion.smoother_kernel import SELDOM
 from tcpipe.fusion.ticks import build_ticks
 from tcpipe.fusion.ukf15 import filter_forward, run_ukf15

@@ -126,7 +126,7 @@ def driving(gap_s, *, moves):
     stamp_s = np.where(true_s < 10.0, true_s, true_s + gap_s)
     place = np.column_stack((stamp_s if moves else true_s, np.zeros((200, 2))))
     stamp_ns, one = np.round(stamp_s * 1e9).astype(np.int64), np.ones((200, 3))
-    wheels = BodyVelocities(stamp_ns, one, one, one[:, 0], one[:, 0])
+    wheels = BodyVelocities(stamp_ns, one, one, one[:, 0])
     return Section(0, Measurements(gnss=Positions(stamp_ns, place, one), wheels=wheels))
 
 

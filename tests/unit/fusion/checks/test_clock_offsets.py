@@ -117,7 +117,6 @@ def drive_with_clocks(**late_s):
         np.column_stack((speed + rng.normal(0, 0.02, t.size), nothing, nothing)),
         one,
         turn + rng.normal(0, 0.02, t.size),
-        one[:, 0],
     )
     gyro = np.column_stack((rng.normal(0, 0.01, (t.size, 2)), turn + rng.normal(0, 0.01, t.size)))
     imu = InertialMeasurements(stamps("imu"), gyro, 9.81 * one, np.full((t.size, 4), np.nan), 0.01, 0.1)

@@ -54,9 +54,7 @@ def measure(speed, turn, *, seed=0, fix_std_m=0.02, without=(), **late_s):
     made = {
         "gnss": Positions(stamps("gnss", 10), enu, np.full(enu.shape, fix_std_m**2)),
         "imu": InertialMeasurements(stamps("imu", 2), gyro, force, np.full((rows, 4), np.nan), 0.01, 0.1),
-        "wheels": BodyVelocities(
-            stamps("wheels", 2), velocity, one, turn[::2] + rng.normal(0.0, 0.03, rows), one[:, 0]
-        ),
+        "wheels": BodyVelocities(stamps("wheels", 2), velocity, one, turn[::2] + rng.normal(0.0, 0.03, rows)),
     }
     return Measurements(**{name: sensor for name, sensor in made.items() if name not in without})
 

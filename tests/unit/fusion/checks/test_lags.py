@@ -109,9 +109,7 @@ def test_an_hour_of_standing_is_not_what_is_judged():
     stamp_ns = np.arange(0, 3 * 3600, dtype=np.int64) * 1_000_000_000
     speed = np.where(stamp_ns > 2.2 * 3600e9, 1.0, 0.0)
     nothing = np.full(speed.size, np.nan)
-    wheels = BodyVelocities(
-        stamp_ns, np.column_stack((speed, nothing, nothing)), np.ones((speed.size, 3)), nothing, nothing
-    )
+    wheels = BodyVelocities(stamp_ns, np.column_stack((speed, nothing, nothing)), np.ones((speed.size, 3)), nothing)
     at_ns = find_liveliest_window_ns(Measurements(wheels=wheels))
     assert at_ns[0] >= 2.1 * 3600e9
     assert (at_ns[-1] - at_ns[0]) * 1e-9 == pytest.approx(1800.0, abs=0.1)
@@ -120,7 +118,7 @@ def test_an_hour_of_standing_is_not_what_is_judged():
 def wheels_at(at_s):
     nothing = np.full(at_s.size, np.nan)
     velocity = np.column_stack((np.ones(at_s.size), nothing, nothing))
-    return BodyVelocities(np.int64(at_s) * 10**9, velocity, np.ones((at_s.size, 3)), nothing, nothing)
+    return BodyVelocities(np.int64(at_s) * 10**9, velocity, np.ones((at_s.size, 3)), nothing)
 
 
 def test_where_nothing_was_measured_for_years_there_are_no_windows():

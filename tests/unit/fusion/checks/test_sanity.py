@@ -34,9 +34,7 @@ def odometry(twist, *, axes=1):
     velocity = np.full((T.size, 3), np.nan)
     velocity[:, :axes] = 0.0
     velocity[:, 0] = twist[:, 0] + noise[:, 0]
-    return BodyVelocities(
-        AT_NS, velocity, np.ones_like(velocity) * 1e-4, twist[:, 1] + noise[:, 1], np.full(T.size, 1e-4)
-    )
+    return BodyVelocities(AT_NS, velocity, np.ones_like(velocity) * 1e-4, twist[:, 1] + noise[:, 1])
 
 
 def gyroscope(yaw_rate=TWIST[:, 1], forward=TWIST):
