@@ -114,7 +114,7 @@ def test_a_camera_whose_scale_varies_is_blamed_and_not_the_fixes_that_it_contrad
     (change,) = found.facts.changes
     assert (change.kind, change.role) == ("scale", "visual_odometry")
     span_s = [(each - drive.ZERO_NS) * 1e-9 for each in (change.start_ns, change.end_ns)]
-    assert span_s == pytest.approx([90.0, 130.0], abs=1.5)
+    assert span_s == pytest.approx([90.0, 130.0], abs=2.0)
     assert drive.errors(truth(), found)["xy"] < 0.05
 
 
@@ -147,8 +147,8 @@ def test_no_side_of_a_step_of_fixes_is_believed(share):
     t, _, off = find_errors(found)
     assert np.mean(off < 2.45) > 0.95
     drms_m = np.hypot(*found.position_std_m[:, :2].T)
-    assert drms_m[t < 40.0].min() > 0.48 * 0.3
-    assert drms_m[t > 120.0].min() > 0.48 * 0.3
+    assert drms_m[t < 40.0].min() > 0.47 * 0.3
+    assert drms_m[t > 120.0].min() > 0.47 * 0.3
 
 
 def test_fixes_that_two_odometries_contradict_smoothly_are_an_excursion():
