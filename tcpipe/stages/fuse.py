@@ -54,9 +54,9 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
     # 1. Streams become sections of measurements: one frame, one set of units, usable variances, without sensors that cannot be right.
     streams, is_local = use_pose_as_fixes(streams)
     sections = exclude_other_clocks(prepare_sections(streams, config), streams)
-    sections = correct_clocks(find_clocks(drop_implausible_sensors(sections, streams)), streams)
+    sections = find_clocks(drop_implausible_sensors(sections, streams))
     # 2. Initial state, filter and smoother of each section.
-    fused, errors = fuse_sections(sections, streams, config)
+    sections, fused, errors = fuse_sections(sections, streams, config)
     failures = merge_findings(finding for error in errors for finding in error.findings)
     if not fused.found:
         problems = [problem for error in errors for problem in error.problems] or ["no motion to fuse"]
@@ -92,24 +92,34 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
     return Track(table, make_rejections_table(sections, fused.found, fixes), info)
 
 
-def fuse_sections(sections: Sequence[Section], streams: Streams, config: FuseConfig) -> tuple[Fused, list[FusionError]]:
-    """Return the track of sections on one clock each, and why some have none.
+def fuse_sections(
+    sections: Sequence[Section], streams: Streams, config: FuseConfig
+) -> tuple[list[Section], Fused, list[FusionError]]:
+    """Return the sections on one clock each, their track, and why some have none.
 
-    A local frame goes on from the end of the section before. Where one section has a place on the earth, those without fixes are skipped.
+    A section is fused again without the offset of a clock that its estimate finds to step. A local frame goes on from the end of the
+    section before. Where one section has a place on the earth, those without fixes are skipped.
     """
-    tracks, errors = list[Fused](), list[FusionError]()
-    for section in sections:
+    given, used, tracks, errors = [*sections], correct_clocks(sections, streams), list[Fused](), list[FusionError]()
+    for place, section in enumerate(used):
         last = next((track.found[-1] for track in reversed(tracks) if track.found), None)
+        tracks.append(_skip(section))
         try:
-            tracks.append(fuse_section(section, streams, config, last))
+            tracks[place] = fuse_section(section, streams, config, last)
+            changes = [change for facts in tracks[place].facts for change in facts.changes if change.kind == "clock"]
+            unsteady = {change.role for change in changes} & section.offsets.keys()
+            if unsteady:
+                steady = {role: offset for role, offset in section.clocks.offsets.items() if role not in unsteady}
+                given[place] = replace(given[place], clocks=replace(section.clocks, offsets=steady))
+                used[place] = correct_clocks(given, streams)[place]
+                tracks[place] = fuse_section(used[place], streams, config, last)
         except FusionError as error:
             errors.append(error)
-            tracks.append(_skip(section))
-    has_place = any(section.datum_deg_m and track.found for section, track in zip(sections, tracks, strict=True))
+    has_place = any(section.datum_deg_m and track.found for section, track in zip(used, tracks, strict=True))
     fused = Fused()
-    for section, track in zip(sections, tracks, strict=True):
+    for section, track in zip(used, tracks, strict=True):
         fused.append(_skip(section) if has_place and section.datum_deg_m is None else track)
-    return fused, errors
+    return used, fused, errors
 
 
 def _skip(section: Section) -> Fused:

@@ -1,7 +1,7 @@
 """Time offsets between the stamps of a run's sensors, by what they measure of the same motion.
 
 Small offsets are states of the estimator, and steps of a clock are hypotheses of it. Larger offsets are found before fusion. Two signals of
-one motion are shifted against each other until one explains most of the other (`motions`): yaw rates and speeds.
+one motion are shifted against each other until one explains most of the other (`motions`): yaw rates, speeds, accelerations.
 They are compared only where the robot turns or changes its speed: on a straight there is nothing to compare but what the controller
 corrects, and that leads the body. The course of the fixes is not compared with the gyroscope: an antenna that sits ahead of the turning
 point by l leads the body's course by l / v, 0.1 s for 10 cm.
@@ -27,6 +27,7 @@ from tcpipe.fusion.checks.motions import (
     SMOOTH_S,
     Lag,
     average,
+    compute_acceleration,
     compute_fix_velocity,
     compute_lag_sums,
     differentiate_course,
@@ -61,15 +62,15 @@ _MAX_STD_S, _MAX_RELATIVE_STD = 0.02, 0.1
 """Largest σ of an offset that is known [s]; and relative to it [1]: the mean of a clock that steps has a larger one."""
 _MIN_EXPLAINED = 0.25
 """Least share of a signal's variance that another one on the right clock explains: noise and slip are the rest."""
-_LEAST_STD_S, _COARSE_STD_S = 1e-3, 0.1
-"""Standard deviations of offsets [s]: at least; by the coarse search."""
+_LEAST_STD_S, _LEAST_BY_FORCE_S, _COARSE_STD_S = 1e-3, 0.02, 0.1
+"""Standard deviations of offsets [s]: at least; by an accelerometer, which slopes act on; by the coarse search."""
 _WINDOW_NS, _MIN_WINDOWS = (40_000_000_000, 600_000_000_000), 3
 """Least and most time in which a clock does not drift [ns], a fifth of the run in between, and how many of these show a drift."""
 _DRIFT_STD = 1e-3  # standard deviation of a clock's drift before the run shows it [1]: ten times that of a quartz
 _LIVELY, _NEAR_ROWS = 0.1, round(2.0 / GRID_S)
 """Yaw rate [rad/s] or change of speed [m/s] of a manoeuvre, and rows around one that are compared: 2 s."""
 
-YAW_RATE, SPEED = "yaw rate", "speed"
+YAW_RATE, SPEED, ACCELERATION = "yaw rate", "speed", "acceleration"
 
 Floats = NDArray[np.float64]
 
@@ -177,10 +178,12 @@ def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tupl
     """Yield what can be compared: whose stamps against whose, by what, target and regressor on the grid, shape (M,)."""
     twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
     if m.imu is not None:
-        turn = average(resample_imu(m.imu, at_ns)[0], SMOOTH_S)
+        turn, force, _ = resample_imu(m.imu, at_ns)
         for role, twist in twists.items():
-            turning = average(twist[:, 1], SMOOTH_S)
-            yield role, IMU, YAW_RATE, _select_near(turning, turning), turn
+            turning, changes = average(twist[:, 1], SMOOTH_S), find_quick_part(average(twist[:, 0], SMOOTH_S))
+            yield role, IMU, YAW_RATE, _select_near(turning, turning), average(turn, SMOOTH_S)
+            if m.imu.accelerometer_usable:
+                yield role, IMU, ACCELERATION, _select_near(changes, compute_acceleration(twist)), force
     if len(twists) == 2:
         target, seen = (find_quick_part(average(np.abs(twists[role][:, 0]), SMOOTH_S)) for role in (VISUAL, WHEELS))
         yield VISUAL, WHEELS, SPEED, _select_near(seen, target), seen
@@ -240,7 +243,7 @@ def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) ->
     connected = _find_connected(reference, pairs)
     used = [pair for pair in pairs if pair.late in connected]
     free = [role for role in ROLES if role in connected and role != reference]
-    std = np.array([max(pair.std_s, _LEAST_STD_S) for pair in used])
+    std = np.array([max(p.std_s, _LEAST_BY_FORCE_S if p.by == ACCELERATION else _LEAST_STD_S) for p in used])
     at_s = np.array([pair.from_middle_s for pair in used])
     signs = np.array([[(role == p.late) - float(role == p.against) for role in free] for p in used]) / std[:, None]
     prior = np.hstack((np.zeros((len(free), len(free))), np.eye(len(free)) / _DRIFT_STD))
