@@ -90,7 +90,7 @@ def test_each_epoch_takes_out_the_drift_of_a_clock_about_its_own_middle():
         assert np.abs(off_s).max() < 0.02
     (finding,) = find_offsets(sections, STREAMS)
     assert (finding.code, finding.span_s[1] - finding.span_s[0]) == (
-        "clocks-differ",
+        "clock-drift",
         pytest.approx(3 * 86_400 + 1900, abs=1),
     )
 
