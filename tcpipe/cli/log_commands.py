@@ -231,7 +231,7 @@ def status(
     Without LOG: the logs and folders that the latest calls of ingest were given. The command does not read logs.
 
     Exit code 3: a log failed, is damaged or gave no segments, a call was killed, files of a run
-    are missing, or a dataset is out of date or its last call failed, and nobody acknowledged it (tcpipe acknowledge).
+    are missing, or a dataset is out of date or its last call failed, and it is not acknowledged (tcpipe acknowledge).
     """
     from tcpipe.formats.finding_lines import format_finding
     from tcpipe.formats.object_storage import is_url

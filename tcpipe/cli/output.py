@@ -1,4 +1,4 @@
-"""What commands print: progress on stderr, results on stdout. Nothing else in `tcpipe` prints, so that every name is escaped here."""
+"""Output of commands: progress on stderr, results on stdout. Nothing else in `tcpipe` prints, so that every name is escaped here."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ page.start(async () => {
   };
 
   // The selection: rows that pass all filters; none without a filter. `current` is the one of them that is shown in words.
-  const filters = new Map();
+  const filters = new Map(), held = ["run", "class", "split", "flag", "quantity", "least", "most"];
   const passes = (i, without) => [...filters].every(([name, passed]) => name === without || passed(i));
   let [selected, current, isLone] = [[], -1, false];
   function setFilter(name, passed) {
@@ -161,6 +161,8 @@ page.start(async () => {
     drawWords();
     drawPage();
     drawExport();
+    const chosen = filters.has("picked") && selected.length <= 200 ? selected.join() : "";
+    page.keep(filters.size ? { ...Object.fromEntries(held.map((id) => [id, at(id).value])), samples: chosen } : {});
   }
   at("filters").closest("section").querySelector(".figures").append(at("filters"));  // beside the histogram
   page.stepThrough(
@@ -171,6 +173,7 @@ page.start(async () => {
   at("clear").onclick = clear;
 
   // One sample in words.
+  const directory = location.protocol === "file:" ? decodeURIComponent(new URL(".", location).pathname).replace(/(.)\/$/, "$1") : "dataset";
   const sheets = facts.patches;
   const cell = new Map((sheets?.rows ?? []).map((row, i) => [row, i]));
   const start = (i) => BigInt(facts.runs[c.run[i]].first_ns) + BigInt(c.after_s[i]) * 1000000000n + BigInt(c.after_ns[i]);
@@ -187,7 +190,7 @@ page.start(async () => {
     const run = facts.runs[c.run[i]];
     return [
       ["split", splitName(i)], ...(Number.isFinite(c.apart[i]) ? [["nearest train", digits(c.apart[i], "apart")]] : []), ["quality", flagsOf(i)],
-      ["run", run.href ? make("a", run.id, { href: run.href }) : run.id], ["time", page.clock(Number(start(i) / 1000000n))], ["where from", page.explain(idOf(i))],
+      ["run", run.href ? make("a", run.id, { href: run.href }) : run.id], ["time", page.clock(Number(start(i) / 1000000n))], ["where from", page.explain(idOf(i), directory)],
     ];
   }
   function drawWords() {
@@ -270,7 +273,6 @@ page.start(async () => {
 
   // Its ids, and what opens them.
   const quoted = (text) => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
-  const directory = location.protocol === "file:" ? decodeURIComponent(new URL(".", location).pathname).replace(/(.)\/$/, "$1") : "DIR";
   function drawExport() {
     const part = facts.count > n ? ` The selection covers the ${n} samples that the page shows, drawn at random from ${facts.count}.` : "";
     const words = filters.size ? `${selected.length} of ${n} samples are selected.` : `Nothing is selected: examples of every split, class and slope.`;
@@ -279,7 +281,7 @@ page.start(async () => {
     at("copy-ids").textContent = "Copy sample_ids";
     const splits = new Set(selected.map(splitName)), of = splits.size === 1 ? `[${JSON.stringify([...splits][0])}]` : "";
     const ids = selected.length > 3 ? '"sample_ids.csv"' : JSON.stringify(selected.map(idOf));
-    at("python").textContent = `tcpipe.open_dataset(${JSON.stringify(directory)})${of}.select(${ids})`;
+    at("python").textContent = `import tcpipe\ntcpipe.open_dataset(${JSON.stringify(directory)})${of}.select(${ids})`;
   }
   at("download").onclick = () => {
     const lines = selected.map((i) => `${quoted(idOf(i))},${splitName(i)}\n`);
@@ -290,5 +292,11 @@ page.start(async () => {
     const isCopied = page.copy(selected.map((i) => `${idOf(i)}\n`).join(""));
     at("copy-ids").textContent = isCopied ? "Copied" : "The browser does not copy: download them";
   };
+  for (const id of held.filter((name) => page.kept.has(name))) {
+    at(id).value = page.kept.get(id);
+    if (id in choices) at(id).onchange();
+  }
+  if (page.kept.has("least") || page.kept.has("most")) setRange();
+  if (page.kept.has("samples")) pick(page.kept.get("samples").split(",").map(Number).filter((i) => i >= 0 && i < n));
   drawSelection();
 });

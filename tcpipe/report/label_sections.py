@@ -149,7 +149,7 @@ _UNITS = {"watt": "W", "mps": "m/s", "s": "s", "joule": "J"}
 
 
 def make_repeatability_section(repeatability: Mapping[str, Floor | None]) -> Section:
-    """Return how well labels repeat themselves."""
+    """Return the repeatability of labels, the lower bound of model errors."""
     rows = []
     for label, entry in repeatability.items():
         unit = _UNITS[label.rsplit("_", 1)[1]]

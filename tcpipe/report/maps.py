@@ -189,7 +189,7 @@ class StoredMaps:
     records: Mapping[str, StoredMap]
     """By name."""
     pictures: dict[str, Pictures] = field(default_factory=dict)
-    """Of the maps that were drawn, for further runs."""
+    """Pictures by name of the map, drawn once for all runs."""
 
 
 def draw_run_map(run: StoredRun, track: pa.Table, segments: pa.Table, maps: StoredMaps, *, has_datum: bool) -> RunMap:

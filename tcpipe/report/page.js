@@ -11,6 +11,7 @@ const page = (() => {
     const item = { docid: "page", root_ids: ids, roots: Object.fromEntries(ids.map((id) => [id, id])) };
     [views] = await Bokeh.embed.embed_items({ page: first }, [item]);
     plots.push(...[...views].filter((view) => "request_paint" in view));
+    if (matchMedia("(pointer: coarse)").matches) plots.forEach((view) => view.model.toolbar.tools.forEach((tool) => { if (/^(Pan|BoxSelect)Tool$/.test(tool.type)) tool.active = false; }));  // a finger scrolls
   }
   const state = document.documentElement.dataset;
   let [printing, goOn] = [false, () => {}];
@@ -127,7 +128,13 @@ const page = (() => {
     return [make("span", low), bar, make("span", `${high} (96 of 100 lie between)`)];
   }
   const clock = (ms) => `${new Date(ms).toISOString().replace("T", " ").replace("Z", "")} UTC`;
-  const explain = (id) => make("code", `tcpipe explain '${id.replaceAll("'", "'\\''")}' --dataset DIR`);
+  const explain = (id, dataset = "dataset") => make("code", `tcpipe explain ${[id, "--dataset", dataset].map((word) => (/^[\w./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`)).join(" ")}`);
+  // What is chosen is a part of the page's address, so that a link leads to it.
+  const kept = new URLSearchParams(location.hash.slice(1));
+  function keep(values) {
+    const words = new URLSearchParams(Object.entries(values).filter(([, value]) => value !== "" && value !== null));
+    history.replaceState(null, "", `${location.href.split("#")[0]}${words.size ? "#" : ""}${words}`);
+  }
   // Pictures under a map, one of which is seen.
   function chooseGround(names) {
     fillSelect(at("ground"), [...names, "none"]);
@@ -199,7 +206,7 @@ const page = (() => {
     }));
   }
   return {
-    at, copy, fixed, make, fillLayers, fillSelect, pairs, patch, patches, legend, ramp, ends, scale, clock, explain, chooseGround, clickNearest, mean, quantity, stepThrough, unpack,
+    at, copy, fixed, keep, kept, make, fillLayers, fillSelect, pairs, patch, patches, legend, ramp, ends, scale, clock, explain, chooseGround, clickNearest, mean, quantity, stepThrough, unpack,
     data: read("page-data"),
     // What a page's own script does when the figures that it asks for are drawn; what it returns is called with the view of each that follows.
     start: (of) => { work = of; },

@@ -178,10 +178,10 @@ def draw_waterfall(distance_by_reason_m: Mapping[str, float]) -> Plot:
 
 
 def render_plots(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
-    """Return Bokeh's JSON and the id of each plot; the same plots have the same ids, whatever this process drew before.
+    """Return Bokeh's JSON and the id of each plot; the same plots have the same ids, independent of what this process drew before.
 
-    ``first`` is a Bokeh document of all plots that do not wait. ``later`` are the roots that join it, in the order of the page; what
-    they share with plots before them, as an axis, is named there and told once.
+    ``first`` is a Bokeh document of all plots that do not wait. ``later`` are the roots that join it, in the order of the page; parts that
+    they share with earlier plots, such as an axis, are named there and written once.
     """
     if not plots:
         return None, []

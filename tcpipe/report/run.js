@@ -214,6 +214,7 @@ page.start(async () => {
   }
   let chosen = null;
   function choose(t) {
+    if (chosen !== null) page.keep({ t: t.toFixed(2) });
     chosen = t;
     point(t);
     at("time").value = t;
@@ -289,7 +290,8 @@ page.start(async () => {
   const wide = at(model("map").id).clientWidth;
   if (wide < 600) model("map").height = Math.round(Math.min(600, Math.max(240, 90 + (wide - 100) * facts.tall_by_wide)));
   paint();
-  if (n) pick(0);
+  if (page.kept.has("t")) choose(Number(page.kept.get("t")) || first);
+  else if (n) pick(0);
   else choose(first);
   page.plots.forEach(join);
   return join;

@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MOST_VALUES = 80_000
-"""Of a series; longer ones are thinned."""
+"""Most values of a series on the page; longer series are thinned."""
 
 _GAP_PERIODS = 10
 """A line is not drawn over so many periods without a value."""
@@ -208,7 +208,7 @@ def _compute_chord_speed(table: pa.Table, t_s: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Spans:
-    """Stretches of the track whose rows are dropped for the same reasons: beginning, end [s] and bits, shape (M,) each."""
+    """Spans of the track whose rows have the same reasons: start, end [s] and bits, shape (M,) each."""
 
     start_s: Floats
     end_s: Floats
@@ -220,7 +220,7 @@ class Spans:
 
 
 def find_mask_spans(track: pa.Table, timeline: Timeline, rate_hz: float) -> Spans:
-    """Return the stretches, kept ones (bits 0) too; a row lasts a period of the track, and where rows are missing no stretch is."""
+    """Return the spans, also those of kept rows (bits 0); a row lasts one period of the track, and missing rows end a span."""
     t_s, bits = _compute_seconds(track, timeline), to_integers(track, "dropped_by")
     period_s = 1.0 / rate_hz
     begin = np.flatnonzero(np.r_[True, (np.diff(bits) != 0) | (np.diff(t_s) > 1.5 * period_s)])
@@ -238,7 +238,7 @@ class FindingSpan:
 
 
 def find_finding_spans(findings: Iterable[Finding], track: pa.Table, timeline: Timeline) -> list[FindingSpan]:
-    """Return the spans of errors and warnings that have one; where its ends lie in no clock epoch, they are seconds of the axis."""
+    """Return the spans of errors and warnings that have one; ends outside the clock epochs are seconds of the axis."""
     spans, start_ns = [], int(to_integers(track, "stamp_ns")[0])
     for finding in findings:
         if finding.severity == "note" or finding.span_s is None:

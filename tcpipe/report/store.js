@@ -96,7 +96,9 @@ page.start(() => {
       quiet = false;
     }
     draw();
+    page.keep(Object.fromEntries(held.map((id) => [id, at(id).value])));
   };
+  const held = ["find", "robot", "state", "dataset", "code"];
   fillSelect(at("robot"), facts.robots.map(([robot]) => robot));
   fillSelect(at("state"), [...new Set(runs.map((run) => run.state))], (state) => `${state} (${runs.filter((run) => run.state === state).length})`);
   fillSelect(at("dataset"), ["none", ...facts.datasets.keys()], (n) => facts.datasets[n] ?? n);
@@ -104,8 +106,10 @@ page.start(() => {
   for (const id of ["robot", "state", "dataset", "code"]) at(id).onchange = filtered;
   at("find").oninput = filtered;
   at("clear").onclick = () => {
-    for (const id of ["find", "robot", "state", "dataset", "code"]) at(id).value = "";
+    for (const id of held) at(id).value = "";
     filtered();
   };
-  draw();
+  for (const id of held.filter((name) => page.kept.has(name))) at(id).value = page.kept.get(id);
+  if (held.some((id) => at(id).value)) filtered();
+  else draw();
 });

@@ -249,6 +249,7 @@ def test_ids_of_a_selection_open_these_samples(chromium, dataset, tmp_path, look
         line = tab.locator("#python").inner_text()
         tab.locator("textarea").evaluate("(area) => area.remove()")
         shown = len(tab.evaluate(SELECTED))
+    _, line = line.splitlines()
     chosen = eval(line.replace("sample_ids.csv", f"{tmp_path}/sample_ids.csv"), {"tcpipe": tcpipe})  # noqa: S307  the line itself is tested
     assert chosen.column("sample_id").tolist() == copied
     assert set(chosen.column("split")) == {"test"}
@@ -266,6 +267,46 @@ def test_of_a_part_of_the_samples_the_page_says_what_a_selection_covers(chromium
         assert "The selection covers the 30 samples that the page shows, drawn at random from 144." in said
         assert tab.get_by_text("not in this page").count() > 0
         assert "tcpipe.open_dataset reads all" in tab.locator("#no-picture").inner_text()
+
+
+def test_a_selection_is_a_part_of_the_address(chromium, dataset):
+    context = chromium.new_context(viewport={"width": 1280, "height": 900})
+    tab = context.new_page()
+    tab.goto((dataset / "report.html").as_uri())
+    tab.wait_for_selector("html[data-ready]")
+    tab.select_option("#split", label="test")
+    tab.locator("#gallery button").nth(2).click()
+    address, chosen = tab.url, tab.evaluate(SELECTED)
+    tab.locator("#clear").click()
+    assert tab.url == (dataset / "report.html").as_uri()
+    again = context.new_page()
+    again.goto(address)
+    again.wait_for_selector("html[data-ready]")
+    assert again.evaluate(SELECTED) == chosen
+    assert again.url == address
+    context.close()
+
+
+def test_a_finger_scrolls_the_page_and_selects_a_sample(chromium, dataset):
+    context = chromium.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    tab = context.new_page()
+    tab.goto((dataset / "report.html").as_uri())
+    tab.wait_for_selector("html[data-ready]")
+    identity = tab.evaluate("page.model('map').id")
+    place = tab.locator(f"#{identity}")
+    assert place.bounding_box()["y"] <= 700
+    place.scroll_into_view_if_needed()
+    tab.touchscreen.tap(*tab.evaluate(PLACE, ["map", *tab.evaluate(f"[{SOURCE}.data.x[3], {SOURCE}.data.y[3]]")]))
+    until(tab, f"{SOURCE}.selected.indices.length === 1")
+    box, before = place.bounding_box(), tab.evaluate("scrollY")
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    touch = context.new_cdp_session(tab)
+    touch.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [{"x": x, "y": y}]})
+    for step in range(1, 11):
+        touch.send("Input.dispatchTouchEvent", {"type": "touchMove", "touchPoints": [{"x": x, "y": y - 15 * step}]})
+    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    until(tab, f"scrollY > {before} + 50")
+    context.close()
 
 
 def test_it_is_worked_by_keyboard(opened):
@@ -468,7 +509,7 @@ def test_a_value_has_as_many_decimals_as_its_uncertainty(chromium, dataset):
 @pytest.mark.parametrize("kind", ["run", "dataset", "evaluation", "store"])
 def test_on_a_phone_the_first_plot_follows_the_verdict(request, chromium, dataset, kind):
     with quiet_page(chromium, find_page(kind, request, dataset), LOOKS[2]) as tab:
-        plot, verdict = tab.evaluate(FIRST_PLOT)[0], tab.locator(".verdict").bounding_box()
+        plot, verdict = tab.evaluate(FIRST_PLOT)[0], tab.locator(".grades").bounding_box()
         assert plot < tab.locator(".numbers").bounding_box()["y"]
         assert plot - verdict["y"] - verdict["height"] < 500.0
 
