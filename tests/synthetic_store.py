@@ -24,7 +24,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import make_lines
-from tcpipe.tables.facts import FuseFacts, NoiseFacts, PowerSign, StageFacts, StretchFacts
+from tcpipe.tables.facts import FuseFacts, PowerSign, StageFacts, StretchFacts
 from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -261,14 +261,9 @@ def make_fixes(stamp_ns, *, drive=0, late_ns=0, topic="/fix"):
     return Streams({"gnss": STREAMS["gnss"].table(**known, **rest)}, {"gnss": sensor}, "husky")
 
 
-def make_noise_facts():
-    """Return facts of a run of fixes and wheels, whose noise was fitted."""
-    time_s = (0.1, 1.0, 10.0, 80.0)
-    noise = {
-        "gnss": NoiseFacts(time_s, (0.02, 0.02, 0.03, 0.03), (0.02,) * 4, (0.9, 0.9, 0.8, 0.7)),
-        "wheel_odometry": NoiseFacts(time_s, (0.002, 0.02, 0.2, 1.0), (0.001, 0.003, 0.01, 0.03), (0.3, 0.4, 0.5, 0.6)),
-    }  # fmt: skip
-    sections = (StretchFacts({}, {}, {}, end_ns=1), StretchFacts({}, {}, {}, noise=noise, end_ns=10**10))
+def make_fuse_facts():
+    """Return facts of a run of two sections."""
+    sections = (StretchFacts({}, {}, {}, end_ns=1), StretchFacts({}, {}, {}, end_ns=10**10))
     return StageFacts(fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, sections))
 
 

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.level_motion import KNOT_S, get_turn_rates
-from tcpipe.fusion.measurements import GNSS, IMU, NO_TRUST, Measurements, Positions
-from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TIMES_S, UP, Residuals
+from tcpipe.fusion.measurements import IMU, NO_TRUST, Measurements, Positions
+from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
 from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std, solve_non_negative
-from tcpipe.tables.facts import NoiseFacts
 
 Floats = NDArray[np.float64]
 
@@ -35,11 +34,6 @@ class GaussMarkov:
     def difference_variance(self, time_s: Floats) -> Floats:
         """Return the variance of the change over each time difference [s]: the structure function."""
         return np.asarray(2.0 * self.variance * -np.expm1(-time_s / self.time_s))
-
-    def integral_variance(self, time_s: Floats) -> Floats:
-        """Return the variance of the integral over each time [s]."""
-        times = time_s / self.time_s
-        return np.asarray(2.0 * self.variance * self.time_s**2 * (times + np.expm1(-times)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -450,41 +444,3 @@ def _compute_density(stamp_ns: NDArray[np.int64], values: Floats) -> float:
     if second.size < _FEWEST:
         return 0.0
     return estimate_robust_std(second) ** 2 / 6.0 * compute_median_period_ns(stamp_ns[finite]) * 1e-9
-
-
-_TIME_S = np.array(TIMES_S)
-_DRIVING_MPS = 0.1
-
-
-def describe_noise(m: Measurements, noise: NoiseModel) -> Mapping[str, NoiseFacts]:
-    """Return by name how far fixes along an axis and distances of odometries err over each time, by the fit and by the claims."""
-    found = {}
-    for name, fixes in ((GNSS, noise.horizontal), (f"{GNSS} height", noise.vertical)):
-        if fixes is not None:
-            correlated = fixes.correlated.difference_variance(_TIME_S), fixes.correlated.data_share
-            fitted = [(np.full_like(_TIME_S, 2.0 * fixes.white), fixes.white_data_share), correlated]
-            found[name] = _make_facts(fitted, np.full_like(_TIME_S, 2.0 * fixes.claimed_m2))
-    for role, odometry in m.odometries().items():
-        speed_mps, own = np.abs(odometry.velocity_mps[:, 0]), noise.odometries[role]
-        driving = speed_mps > _DRIVING_MPS
-        usual_mps = float(np.median(speed_mps[driving])) if driving.any() else 0.0
-        scales = [
-            (usual_mps**2 * each.integral_variance(_TIME_S), each.data_share)
-            for each in (own.correlated, noise.shared_scale)
-        ]
-        fitted = [(own.white * _TIME_S, own.white_data_share), *scales]
-        found[role] = _make_facts(fitted, _sum_white(odometry.stamp_ns, odometry.variance_m2ps2[:, 0]))
-    return found
-
-
-def _sum_white(stamp_ns: NDArray[np.int64], variance: Floats) -> Floats:
-    """Return the variance of the integral of a rate whose samples err independently of each other by a variance."""
-    return np.asarray(np.nanmedian(variance) * compute_median_period_ns(stamp_ns) * 1e-9 * _TIME_S)
-
-
-def _make_facts(fitted: Sequence[tuple[Floats, float]], claimed: Floats) -> NoiseFacts:
-    """Return the facts of variances over each time, each with the share of it that the data determine."""
-    whole = np.sum([variance for variance, _ in fitted], axis=0)
-    from_data = np.sum([share * variance for variance, share in fitted], axis=0) / whole
-    rows = (np.sqrt(whole), np.sqrt(claimed), from_data)
-    return NoiseFacts(TIMES_S, *(tuple(float(f"{value:.4g}") for value in row) for row in rows))

@@ -31,7 +31,7 @@ from tcpipe.fusion.changes import (
     join_events,
 )
 from tcpipe.fusion.dead_reckoning import compute_course
-from tcpipe.fusion.densities import PRIORS, NoiseModel, describe_noise, fit_noise, inflate_unclaimed_fixes
+from tcpipe.fusion.densities import PRIORS, NoiseModel, fit_noise, inflate_unclaimed_fixes
 from tcpipe.fusion.filter_kernel import (
     ACCEPTED,
     NONE,
@@ -428,7 +428,7 @@ def make_trajectory(
         forward_velocity_std_mps=np.sqrt(speed_variance + (scale_std * speed) ** 2),
         rejections=_make_rejections(m, made),
         displacement_std_m=np.sqrt(links),
-        facts=replace(_make_facts(m, made, smoothed, std, scale_std, explained), noise=describe_noise(m, noise)),
+        facts=_make_facts(m, made, smoothed, std, scale_std, explained),
     )
 
 

@@ -114,20 +114,6 @@ class ParameterFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class NoiseFacts:
-    """σ of the change of a sensor's error over each of ``time_s`` [s], as fitted to the section, and by its covariances alone.
-
-    [m], of fixes along one axis, of the distance of an odometry at its median speed. ``data_share``: the share of the fitted variance that
-    the data determine; the rest is what is known beforehand.
-    """
-
-    time_s: tuple[float, ...]
-    std: tuple[float, ...]
-    claimed_std: tuple[float, ...]
-    data_share: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class StretchFacts:
     """One section that was fused in one pass: counts and estimates of the filter, then its span and initial state.
 
@@ -142,7 +128,6 @@ class StretchFacts:
     """σ of the unobservable common odometry scale, included in σ of distances, speeds and labels."""
     changes: tuple[ChangeFacts, ...] = field(default=(), metadata=LEFT_OUT)
     parameters: Mapping[str, ParameterFacts] = field(default_factory=dict, metadata=LEFT_OUT)
-    noise: Mapping[str, NoiseFacts] = field(default_factory=dict, metadata=LEFT_OUT)
     clock_epoch: int = 0
     start_ns: int = 0
     end_ns: int = 0

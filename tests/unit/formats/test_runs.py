@@ -4,7 +4,7 @@ import re
 from dataclasses import replace
 
 import pytest
-from synthetic_store import add_run, lanes, make_noise_facts, segments, supersede
+from synthetic_store import add_run, lanes, make_fuse_facts, segments, supersede
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.documents import Name, read_record
@@ -21,7 +21,7 @@ DAMAGE = (make_finding("file-cut", Subject("file", "a.mcap")),)
 def store(tmp_path):
     """A store with one run."""
     store = open_store(tmp_path / "store", create=True)
-    add_run(store, "a", segments("a", *lanes(0.0, -5.0, 5.0)), facts=make_noise_facts(), findings=DAMAGE, damage=DAMAGE)
+    add_run(store, "a", segments("a", *lanes(0.0, -5.0, 5.0)), facts=make_fuse_facts(), findings=DAMAGE, damage=DAMAGE)
     return store
 
 

@@ -286,5 +286,4 @@ def test_an_error_of_a_metre_that_lasts_leaves_the_scale_open():
     found = fuse(replace(all_of_it, gnss=fixes))
     true = drive.errors(truth(), found)["forward"]
     moving = np.linalg.norm(found.velocity_enu_mps, axis=1) > 0.5
-    assert found.facts.noise["gnss"].std[-1] > 1.0
     assert np.median(found.forward_velocity_std_mps[moving]) > true

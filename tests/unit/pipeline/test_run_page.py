@@ -127,15 +127,6 @@ def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(page):
     assert "Kept and excluded distances add up to the odometer" in html
 
 
-def test_the_noise_of_every_fused_sensor_is_in_the_facts_and_on_the_page(page):
-    run, html = page
-    noise = run.manifest.info.report.facts.fuse.stretches[0].noise
-    assert {"gnss", "gnss height", "wheel_odometry", "visual_odometry"} == set(noise)
-    assert all(0.0 <= share <= 1.0 for each in noise.values() for share in each.data_share)
-    section = html.split("<h2>Sensors</h2>")[1].split("<h2>")[0]
-    assert all(name.replace("_", " ") in section for name in noise)
-
-
 def test_every_topic_stands_on_the_page_and_may_break(page):
     run, html = page
     with open_log(run.facts.log.paths[0]) as log:

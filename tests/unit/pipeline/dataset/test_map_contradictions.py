@@ -7,7 +7,7 @@ import pytest
 from made_tracks import with_columns
 from map_worlds import write_tif
 from rasterio import Affine
-from synthetic_store import WORLD, add_run, make_noise_facts, put_map, segments
+from synthetic_store import WORLD, add_run, make_fuse_facts, put_map, segments
 
 from tcpipe import open_dataset
 from tcpipe.formats.dataset_files import read_card
@@ -57,7 +57,7 @@ def lay_out(*, north):
 def make_store(directory):
     """Make a store of three runs on the true ground: two with an IMU, one of them driven backwards, and one with neither."""
     store, rng = open_store(directory / "store", create=True), np.random.default_rng(1)
-    fuse = make_noise_facts().fuse
+    fuse = make_fuse_facts().fuse
     for number, (name, backwards, sensors) in enumerate((("a", False, ("gnss", "imu")), ("b", True, ("gnss", "imu")))):
         start, end = lay_out(north=backwards)
         table = measured(segments(name, start, end, start_ns=number * 10**13), start, end, rng, backwards=backwards)
