@@ -87,9 +87,6 @@ class PlanPathOptions:
         None,
         Option("Print the probability that this energy suffices: 300Wh, 500kJ.", (), "energy", "ENERGY"),
     )
-    round_trip: bool = option(
-        False, Option("Plan the way back, too; a budget is for both.", ("--return", "--round-trip"))
-    )
     origin: tuple[float, float] | None = option(None, _ORIGIN)
     speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)

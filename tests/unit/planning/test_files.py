@@ -96,7 +96,7 @@ def test_messages_for_nav2_are_along_the_path_in_true_east_and_north(tmp_path):
     source = replace(source, grid=replace(source.grid, x_min_m=720_000.0))
     ends = lonlat(source, (4.0, 4.0), (20.0, 4.0))
     options = PlanPathOptions(
-        "model", *map(tuple, ends.tolist()), out=tmp_path / "p.geojson", origin_deg=tuple(ends[0].tolist())
+        "model", *map(tuple, ends.tolist()), out=tmp_path / "p.geojson", origin=tuple(ends[0].tolist())
     )
     found = plan(MODEL, source, options)
     message = json.loads(found.nav2_path.read_text())
