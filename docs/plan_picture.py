@@ -56,11 +56,12 @@ def draw_plans(path: Path, source: MapReader, plans: Sequence[Plan]) -> None:
                 f"Least {totals.objective}: {totals.known_energy_joule / 1000.0:.2f} kJ, {totals.duration_s:.0f} s, "
                 f"{totals.length_m:.0f} m"
             )
-            axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="x [m]", ylabel="y [m]", aspect="equal")
-            axes.ticklabel_format(useOffset=False, style="plain")
+            axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="east [m]", ylabel="north [m]", aspect="equal")
+            axes.xaxis.set_major_formatter(lambda x, _: f"{x - left:.0f}")
+            axes.yaxis.set_major_formatter(lambda y, _: f"{y - bottom:.0f}")
         figure.colorbar(line, ax=panels, shrink=0.7, label="energy a metre along the path [J/m]")
         with write_atomic_file(path) as temporary:
-            figure.savefig(temporary, format="png", dpi=130, metadata={"Software": None})
+            figure.savefig(temporary, format="png", dpi=130, bbox_inches="tight", metadata={"Software": None})
 
 
 def _crop(source: MapReader, xy_m: Array) -> Bounds:
