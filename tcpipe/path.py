@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from tcpipe.geometry.polyline import Polyline
 
-Floats = NDArray[np.float64]
-
 _LEAST_M = 1e-3
 """A rest shorter than this is the rounding of coordinates, not a piece [m]."""
 

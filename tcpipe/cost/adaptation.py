@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import stdtrit
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.prediction_errors import COVERAGE, NORMAL_HALF_WIDTH, Errors, SumDistribution
-
-Floats = NDArray[np.float64]
 
 _CHANGES = {0.0: 0.7, 0.1: 0.15, 0.3: 0.15}
 """Prior probability of each standard deviation q of a relative change."""

@@ -21,13 +21,12 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.power.noise import compute_median_period_s
 from tcpipe.power.rails import Rail, SampledSignal, is_power_only
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.facts import CAUSES, EnergyBudget
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

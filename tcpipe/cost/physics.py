@@ -25,10 +25,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.robust import estimate_robust_std, solve_non_negative
 from tcpipe.tables.facts import PhysicsFit, PhysicsScore, PhysicsTerm
-
-Floats = NDArray[np.float64]
 
 FEWEST = 20  # segments for a fit, and for coefficients of a class
 _LEAST_SLOPE = 0.02  # standard deviation of the rises; on flatter ground weight and rolling are not observable

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression, nnls
 from scipy.special import ndtr, ndtri, stdtrit
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from tcpipe.arrays import Floats, Ints
+
 Classes = NDArray[np.integer]
 Stated = Floats | float | None
 Near = NDArray[np.bool_] | None

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.tables.facts import Floor
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _FEWEST_FITTED = 12
 """Below so many samples a class is described by its mean, not by a parabola over slope."""

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats32, Ints
 from tcpipe.dataset.tensor import TensorLayout
 from tcpipe.formats.dataset_files import PatchFiles
 
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Batch = tuple[Floats | tuple[Floats, Floats], ...]
+Batch = tuple[Floats32 | tuple[Floats32, Floats32], ...]
 Pixels = dict[str, NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]]
 
 IN_MEMORY_BYTES = 2 << 30
@@ -138,9 +137,9 @@ class Batches:
     """
 
     view: SampleView
-    labels: Floats
+    labels: Floats32
     """Shape (N, 2)."""
-    weights: Floats | None
+    weights: Floats32 | None
     """Shape (N, 2)."""
     features: Sequence[tuple[str, NDArray[np.generic]]]
     """Names and values of columns, shape (N,)."""

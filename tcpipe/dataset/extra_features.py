@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
+
 if TYPE_CHECKING:
     from tcpipe.dataset.split import Split
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

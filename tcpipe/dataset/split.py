@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
+from tcpipe.arrays import Floats32, Ints
 from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
 from tcpipe.dataset.energies import ENERGIES, Energy, find_energy, name_common_std
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
@@ -40,8 +41,6 @@ from tcpipe.terrain.layers import LAYERS
 if TYPE_CHECKING:
     from tcpipe.dataset.torch_data import TorchBatches
 
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 _MIN_STD = 0.1
 """Standard deviations are taken as at least this share of their median, so that no sample outweighs a hundred."""
@@ -99,19 +98,19 @@ class Split:
         """Name the split, its size and its channels."""
         return f"Split({self.name!r}: {len(self)} samples of {', '.join(self.channels) or 'labels, without patches'})"
 
-    def __getitem__(self, index: int) -> tuple[Floats, Floats]:
+    def __getitem__(self, index: int) -> tuple[Floats32, Floats32]:
         """Return the patch, shape (px, px, channels) in [0, 1], and the labels, shape (labels,), of one sample."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"sample {index} of {len(self)} in split {self.name}")
         patches, labels = self.batch([index])
         return patches[0], labels[0]
 
-    def __getitems__(self, indices: Sequence[int]) -> list[tuple[Floats, Floats]]:
+    def __getitems__(self, indices: Sequence[int]) -> list[tuple[Floats32, Floats32]]:
         """Return many samples at once; torch's loader asks for whole batches this way."""
         patches, labels = self.batch(indices)
         return list(zip(patches, labels, strict=True))
 
-    def __iter__(self) -> Iterator[tuple[Floats, Floats]]:
+    def __iter__(self) -> Iterator[tuple[Floats32, Floats32]]:
         """Iterate over the samples in order."""
         return (
             (patch, label) for patches, labels in self.batches(64) for patch, label in zip(patches, labels, strict=True)
@@ -143,12 +142,12 @@ class Split:
         return (self.energy.power, velocity) if self.has_energy else (velocity,)
 
     @cached_property
-    def labels(self) -> Floats:
+    def labels(self) -> Floats32:
         """Power [W] and velocity [m/s], or velocity alone, float32, shape (N, labels): its `label_columns`."""
         return np.column_stack([self.column(name) for name in self.label_columns]).astype(np.float32)
 
     @cached_property
-    def weights(self) -> Floats:
+    def weights(self) -> Floats32:
         """Inverse variance of each label over its mean, float32, shape (N, labels); 0 if the variance is unknown.
 
         The part that all labels of a run share is excluded: no weights average it out.
@@ -158,7 +157,7 @@ class Split:
         return np.column_stack([_compute_inverse_variance_weights(column) for column in std.T]).astype(np.float32)
 
     @cached_property
-    def patches(self) -> Floats:
+    def patches(self) -> Floats32:
         """The tensor of all samples, float32 in [0, 1], shape (N, px, px, channels); formed once, then kept."""
         return self._form_tensor(np.arange(len(self)))
 
@@ -176,7 +175,7 @@ class Split:
         """Return the stored layers of samples, each of shape (B, px, px): as ``dataset.json`` says of each."""
         return self.view.stored.gather(self.view.at[indices], self.view.form.layers)
 
-    def batch(self, indices: ArrayLike) -> tuple[Floats, Floats]:
+    def batch(self, indices: ArrayLike) -> tuple[Floats32, Floats32]:
         """Return patches, shape (B, px, px, channels), and labels, shape (B, labels), of the samples ``indices``."""
         at = np.asarray(indices, dtype=np.int64)
         at = np.where(at < 0, at + len(self), at)
@@ -308,7 +307,7 @@ class Split:
                 f"{self._columns.directory}: has no patches; take its samples and labels, or add a map (tcpipe add-map) and build it again"
             )
 
-    def _form_tensor(self, indices: Ints) -> Floats:
+    def _form_tensor(self, indices: Ints) -> Floats32:
         self._require_patches()
         layers = self.view.form.layers
         if self.view.stored.fit(layers):

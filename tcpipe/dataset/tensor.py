@@ -9,16 +9,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats32, Ints, Mask
 from tcpipe.compiled import compile_kernel
 from tcpipe.errors import DatasetError
 from tcpipe.terrain.layers import Layer, sort_layers
 
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
 
 @compile_kernel
-def form_bytes(layer: NDArray[np.uint8], rows: Ints, mirrored: Mask, value: Floats, channel: int, out: Floats) -> None:  # noqa: PLR0917
+def form_bytes(  # noqa: PLR0917
+    layer: NDArray[np.uint8], rows: Ints, mirrored: Mask, value: Floats32, channel: int, out: Floats32
+) -> None:
     """Write ``value`` of each byte of ``rows`` to one channel of ``out``, (B, px, px, C)."""
     px = out.shape[1]
     for b in range(rows.size):
@@ -39,7 +39,7 @@ def form_numbers(  # noqa: PLR0917
     scale: np.float32,
     offset: np.float32,
     channel: int,
-    out: Floats,
+    out: Floats32,
 ) -> None:
     """Write numbers of ``rows``, scaled and clipped to [0, 1], to one channel of ``out``, (B, px, px, C); NaN and ``nodata`` become 0."""
     px, none, whole = out.shape[1], np.float32(0.0), np.float32(1.0)
@@ -53,7 +53,6 @@ def form_numbers(  # noqa: PLR0917
                 line[c, channel] = value if stored[c] == stored[c] and stored[c] != nodata else none
 
 
-Floats = NDArray[np.float32]
 Pixels = Mapping[str, NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]]
 
 ONE_HOT = "_one_hot"
@@ -105,7 +104,7 @@ class TensorLayout:
         layer = self.known[self._name_layer(channel)]
         return 1 if layer.name == channel else round(layer.high)
 
-    def form(self, pixels: Pixels, rows: NDArray[np.int64], mirrored: NDArray[np.bool_] | None = None) -> Floats:
+    def form(self, pixels: Pixels, rows: NDArray[np.int64], mirrored: NDArray[np.bool_] | None = None) -> Floats32:
         """Return the tensor of ``rows``, shape (B,), of stored layers: float32, shape (B, px, px, depth).
 
         ``mirrored`` marks those that are mirrored across their direction of travel, shape (B,).

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.prediction_errors import make_residuals
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.formats.json_files import read_as, write_json
@@ -26,7 +27,6 @@ from tcpipe.learning.training import make_samples
 
 logger = logging.getLogger("tcpipe")
 
-Floats = NDArray[np.float64]
 Batch = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 ALL_LAYERS, HEIGHTS, GRASS = "a net per class, all layers", "Wei & Isler, a net per class", "Wei & Isler, grass only"

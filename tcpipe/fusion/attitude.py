@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.fusion.measurements import UNMEASURED_RAD2, BodyVelocities, Positions
 from tcpipe.geometry.rotation import (
     invert,
@@ -23,8 +23,6 @@ from tcpipe.geometry.rotation import (
     rotation_vector_from_quat,
 )
 from tcpipe.robust import MEDIAN_OF_SQUARES
-
-Floats = NDArray[np.float64]
 
 STATED_MOUNTING_STD_RAD, UNSTATED_MOUNTING_STD_RAD = 0.0175, 0.1
 _DEFAULT_STD_RAD = 0.01  # scan matching and visual SLAM state none, or any

@@ -15,6 +15,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import NoiseModel
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, Tests
@@ -24,9 +25,6 @@ from tcpipe.fusion.parameters import FIX_AXES, Event
 from tcpipe.fusion.signals import SPIKE_RATIO, compute_running_median
 from tcpipe.fusion.ticks import Ticks
 from tcpipe.tables.findings import read_threshold
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 ROLES = {
     state.WHEELS: WHEELS,

@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 from tcpipe.fusion.process import turn_sources
 from tcpipe.fusion.signals import (
@@ -20,8 +20,6 @@ from tcpipe.fusion.signals import (
     is_covered,
     remove_wild_places,
 )
-
-Floats = NDArray[np.float64]
 
 MIN_SPEED_MPS = 0.2
 """Speed below which motion shows no course [m/s] (ruling)."""

@@ -11,13 +11,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.fusion.level_motion import KNOT_S, get_turn_rates
 from tcpipe.fusion.measurements import IMU, NO_TRUST, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
 from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std, solve_non_negative
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
 from tcpipe.fusion.changes import (
@@ -77,9 +77,6 @@ from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
 from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding, read_threshold
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _LEVELLING_S = 60.0
 """The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.dead_reckoning import reckon_dead
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.signals import (
@@ -30,9 +31,6 @@ from tcpipe.fusion.signals import (
     remove_wild_places,
 )
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _MIN_COURSE_M = 5.0  # driven before course gives yaw (ruling)
 _MIN_COURSE_STD = 10.0  # distance over σ of fixes: yaw to 6°

@@ -15,6 +15,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.measurements import IMU, BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import (
     Plane,
@@ -28,8 +29,6 @@ from tcpipe.fusion.signals import (
 )
 from tcpipe.geometry.rotation import matrix_from_quat, multiply, normalize, quat_from_rotation_vector, quat_from_rpy
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 _Number = TypeVar("_Number", np.float64, np.complex128)
 
 STEP_S, KNOT_S, _PITCH_KNOT_S = 0.05, 60.0, 240.0

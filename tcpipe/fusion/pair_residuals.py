@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.fusion.level_motion import (
     STEP_S,
     Attitude,
@@ -37,10 +37,6 @@ from tcpipe.fusion.signals import (
     is_in_gap,
     remove_spikes,
 )
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 ALONG, ACROSS, UP = "along", "across", "up"
 TIMES_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0)

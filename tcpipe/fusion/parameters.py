@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel, Prior
 from tcpipe.fusion.filter_kernel import MOTION_WITH_GYRO, MOTION_WITHOUT_GYRO, Memory, Model
@@ -20,8 +20,6 @@ from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, is_length_observab
 from tcpipe.fusion.signals import find_chi_square_threshold
 from tcpipe.fusion.ticks import Ticks
 from tcpipe.geometry.rotation import matrix_from_quat
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.fusion.attitude import add_attitude, compute_turns
 from tcpipe.fusion.measurements import (
     IMU,
@@ -37,10 +37,6 @@ from tcpipe.fusion.signals import (
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate
 from tcpipe.tables.findings import Finding, Subject, make_finding
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 Columns = Mapping[str, Floats]
 """Columns of a stream by name, null as NaN."""

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import PRIORS, NoiseModel, SensorNoise
 from tcpipe.fusion.measurements import (
@@ -31,9 +32,6 @@ from tcpipe.fusion.signals import (
     remove_wild_places,
 )
 from tcpipe.robust import estimate_robust_std
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 SCALE_STD: Mapping[str, float] = {
     WHEELS: 0.12,  # slip of a skid-steered robot on grass

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from tcpipe.arrays import Floats, Ints
+
 Plane = NDArray[np.complex128]
 Signal = NDArray[Any]
 """Samples of a signal: real, complex or whole numbers."""

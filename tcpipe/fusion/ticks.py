@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
 from tcpipe.fusion.dead_reckoning import compute_course_rate
@@ -38,9 +39,6 @@ from tcpipe.fusion.signals import (
 )
 from tcpipe.geometry.rotation import rotation_vector_from_quat
 from tcpipe.robust import estimate_robust_std
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _LONGEST_NS = 50_000_000
 _STATIONARY_EVERY_S = 0.2

@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
 from tcpipe.fusion.changes import Hypothesis
 from tcpipe.fusion.error_state import make_tests, make_trajectory, prepare_section
@@ -23,9 +23,6 @@ from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Memory, Model
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S, InitialState, Measurements, Trajectory
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed
 from tcpipe.fusion.ticks import Pass, Ticks
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _MAX_ANGLE_STD_RAD = 1.0  # sigma points lie at √3 σ, and must not go round the circle
 _RESET_COUNT, _RESET_S = 5, 5.0

@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaincinv
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.errors import FusionError
 from tcpipe.fusion.measurements import Positions
 from tcpipe.fusion.signals import compute_seconds, is_in_gap
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 END_S = 5.0
 """Time at either end of a run in which fixes stay [s]: the track starts from them and ends at them."""

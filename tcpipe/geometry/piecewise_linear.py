@@ -10,10 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.geometry.polyline import find_row_before
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _NS = 1e-9
 

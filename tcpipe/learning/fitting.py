@@ -15,13 +15,11 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats32
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.recipe import TrainConfig
 from tcpipe.tables.bounds import Bounds
-
-Floats = NDArray[np.float32]
 
 ModelKind = Literal["linear", "physics", "boosting", "resnet18", "own"]
 """Curves of class and slope, physics, a curve and boosted trees, the paper's network, or own code."""
@@ -65,7 +63,7 @@ _SMALLEST = 1e-12
 """Added under the root [1]; without it the loss has no gradient at a perfect prediction."""
 
 
-def compute_loss_factors(loss: Loss, scale: Sequence[float]) -> Floats:
+def compute_loss_factors(loss: Loss, scale: Sequence[float]) -> Floats32:
     """Return the factor of each output's squared error over its maximum, shape (outputs,)."""
     return np.array(scale, np.float32) if loss == "paper_eq4" else np.ones(len(scale), np.float32)
 

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
+from tcpipe.arrays import Floats
 from tcpipe.tables.facts import ABSENT
-
-Array = NDArray[np.float64]
 
 QUANTITIES = ("w", "v", "T", "E")
 UNITS = {"w": "W", "v": "m/s", "T": "s", "E": "J"}
@@ -36,7 +35,7 @@ LEAST_VELOCITY_MPS = 0.05
 
 ALL = "all"
 
-Costs = Mapping[str, Array]
+Costs = Mapping[str, Floats]
 """Quantity to values, each of shape (N,)."""
 
 
@@ -61,16 +60,16 @@ class Errors:
 class Spread:
     """Stated errors of predictions, shape (N,) each: standard deviation, and the ends of 90 % intervals."""
 
-    std: Array
-    low: Array
-    high: Array
+    std: Floats
+    low: Floats
+    high: Floats
 
     def take(self, rows: NDArray[np.bool_]) -> Spread:
         """Return some of them."""
         return Spread(self.std[rows], self.low[rows], self.high[rows])
 
 
-def compute_errors(predicted: Array, measured: Array, least: float = 0.0, spread: Spread | None = None) -> Errors:
+def compute_errors(predicted: Floats, measured: Floats, least: float = 0.0, spread: Spread | None = None) -> Errors:
     """Return the errors of predictions, both of shape (N,), and their scores where a spread is stated."""
     difference = np.asarray(predicted, np.float64) - measured
     large = measured >= least
@@ -86,7 +85,7 @@ _LEAST_STD = 1e-9
 """Least standard deviation; labels that are all equal have none."""
 
 
-def _compute_scores(off: Array, measured: Array, spread: Spread) -> tuple[float, float, float]:
+def _compute_scores(off: Floats, measured: Floats, spread: Spread) -> tuple[float, float, float]:
     std = np.maximum(spread.std, _LEAST_STD)
     z = off / std
     density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
@@ -168,7 +167,7 @@ PATH_M = 30
 
 
 def compute_path_error(
-    predicted: Array, measured: Array, runs: NDArray[np.generic], start_ns: NDArray[np.generic]
+    predicted: Floats, measured: Floats, runs: NDArray[np.generic], start_ns: NDArray[np.generic]
 ) -> float:
     """Return the error of sums over consecutive paths of `PATH_M` samples of a run [%]: root mean square, over the mean sum.
 
@@ -183,13 +182,11 @@ def compute_path_error(
     return 100.0 * float(np.sqrt(np.mean((said - true) ** 2))) / size if size else 0.0
 
 
-def compute_costs(power_watt: Array, velocity_mps: Array, chord_m: float) -> dict[str, Array]:
+def compute_costs(power_watt: Floats, velocity_mps: Floats, chord_m: float) -> dict[str, Floats]:
     """Return w, v, T = d / v and E = w d / v."""
     w, v = np.asarray(power_watt, np.float64), np.asarray(velocity_mps, np.float64)
     return {"w": w, "v": v, "T": chord_m / v, "E": w * chord_m / v}
 
-
-Floats = NDArray[np.float64]
 
 _DRAWS = 2000
 _TAILS = (0.025, 0.975)

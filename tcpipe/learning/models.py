@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats32
 from tcpipe.cost.prediction_errors import Errors, estimate_correlation, fit_errors
 from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
 from tcpipe.errors import ModelError, StoreError, UsageError
@@ -39,7 +40,6 @@ from tcpipe.splits.audit import CLOSE, are_near
 
 logger = logging.getLogger("tcpipe")
 
-Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
 
 FILES = CARD, WEIGHTS, RESIDUALS, GROUND, HISTORY = (
@@ -103,7 +103,7 @@ class Model:
     def _correlation(self) -> float:
         return estimate_correlation(self.residuals)
 
-    def ask(self, patches: Floats, features: ExtraFeatures | None = None) -> Prediction:
+    def ask(self, patches: Floats32, features: ExtraFeatures | None = None) -> Prediction:
         """Return the predictions of patches in [0, 1], shape (N, px, px, depth), and the covariances that the predictor states.
 
         A model of time alone gives power and velocity, too: its power is NaN.
@@ -125,7 +125,7 @@ class Model:
             said.mean[:, column] = np.maximum(said.mean[:, column], LEAST_VELOCITY_MPS)
         return said.add_unknown_power() if inputs.is_time_alone else said
 
-    def predict(self, patches: Floats, features: ExtraFeatures | None = None) -> Prediction:
+    def predict(self, patches: Floats32, features: ExtraFeatures | None = None) -> Prediction:
         """Return power [W] and velocity [m/s] of patches as `ask`, with the covariances of their errors on new ground.
 
         The covariances come from held-out predictions, which also scale those that the model states.

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.nn import functional
 
+from tcpipe.arrays import Floats32
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import check_arrays
 from tcpipe.learning.fitting import mean_loss
 
-Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
 
 _TOGETHER = 256
@@ -87,7 +87,7 @@ class ResNet18(nn.Module):
             values = block(values) if name.startswith("stage") else values
         return self.head(values.mean((2, 3)))
 
-    def predict(self, patches: Floats) -> Floats:
+    def predict(self, patches: Floats32) -> Floats32:
         """Return outputs of patches of shape (N, px, px, depth), some at a time, shape (N, outputs)."""
         self.eval()
         out = np.empty((len(patches), self.head.out_features), np.float32)
@@ -146,7 +146,7 @@ def find_device_name() -> str:
     return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "cpu"
 
 
-def move_to_device(patches: Floats) -> Any:
+def move_to_device(patches: Floats32) -> Any:
     """Return patches (N, px, px, depth) as images (N, depth, px, px), with the memory layout of the patches."""
     return torch.from_numpy(np.ascontiguousarray(patches, np.float32)).to(find_device()).permute(0, 3, 1, 2)
 
@@ -168,7 +168,7 @@ _EPSILON = 1e-7
 class Trainer:
     """A network and the optimiser that trains it: arrays in, arrays out."""
 
-    def __init__(self, network: ResNet18, factors: Floats) -> None:
+    def __init__(self, network: ResNet18, factors: Floats32) -> None:
         self.network = network
         self._factors = torch.from_numpy(factors).to(find_device())
         self.optimizer = torch.optim.Adam(network.parameters(), eps=_EPSILON)
@@ -199,7 +199,7 @@ class Trainer:
         """Return a copy of every weight by torch's name."""
         return {name: value.clone() for name, value in self.network.state_dict().items()}
 
-    def step(self, patches: Floats, labels: Floats, learning_rate: float) -> float:
+    def step(self, patches: Floats32, labels: Floats32, learning_rate: float) -> float:
         """Train on a batch, patches (N, px, px, depth) and labels (N, outputs); return its mean loss."""
         if len(patches) == 1:  # batch normalisation needs two values; a repeated sample has the same mean and gradient
             patches, labels = (np.repeat(values, 2, axis=0) for values in (patches, labels))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats32
 from tcpipe.dataset.extra_features import (
     COLUMNS,
     ExtraFeatures,
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from tcpipe.learning.network import ResNet18, Trainer
 
 Arrays = Mapping[str, NDArray[np.generic]]
-Floats = NDArray[np.float32]
 
 logger = logging.getLogger("tcpipe")
 
@@ -121,7 +121,7 @@ class NetworkModel(Predictor):
 
     stops_by_fold: ClassVar[bool] = True
 
-    def predict(self, patches: Floats, features: ExtraFeatures) -> Floats:
+    def predict(self, patches: Floats32, features: ExtraFeatures) -> Floats32:
         """Return the outputs."""
         numbers = standardize_features(self.inputs.extra_features, features)
         return self.network.predict(append_planes(patches, numbers)) * np.array(self.inputs.scale, np.float32)
@@ -186,7 +186,7 @@ class NetworkModel(Predictor):
             _log_epoch(job.name, progress, config, times)
 
     @staticmethod
-    def iterate_batches(fit: Samples, epoch: int) -> Iterator[tuple[Floats, Floats]]:
+    def iterate_batches(fit: Samples, epoch: int) -> Iterator[tuple[Floats32, Floats32]]:
         """Yield patches (N, px, px, depth) and labels (N, outputs) of every sample once."""
         config, inputs = fit.config, fit.inputs
         rules: dict[str, Any] = {"features": COLUMNS} if inputs.extra_features else {}

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.physics import ALL, FEWEST, FitSamples, Physics, fit_physics
 from tcpipe.dataset import Split
 from tcpipe.dataset.energies import ENERGIES
@@ -21,8 +22,6 @@ from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm, check_arrays
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.predictor import Inputs, Patches, Predictor, Samples
-
-Floats = NDArray[np.float64]
 
 _CLASSES = 256
 

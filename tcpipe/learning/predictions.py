@@ -10,11 +10,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.prediction_errors import COVERAGE, Residuals, fit_bias_correction, propagate_stated
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import ModelError
-from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, QUANTITIES, UNITS, Array, Spread, compute_costs
+from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, QUANTITIES, UNITS, Spread, compute_costs
 from tcpipe.learning.model_card import ModelCard
 from tcpipe.learning.models import Model
 from tcpipe.learning.predictor import Prediction
@@ -34,9 +35,9 @@ class Measured:
     """The labelled samples of a split: w, v, T, E, their deviations, and terrain classes."""
 
     split: Split
-    costs: Mapping[str, Array]
-    deviations: Mapping[str, Array]
-    own_deviations: Mapping[str, Array]
+    costs: Mapping[str, Floats]
+    deviations: Mapping[str, Floats]
+    own_deviations: Mapping[str, Floats]
     """Standard deviations without the error that all labels of a run share, which a model learns."""
     class_ids: NDArray[np.int64]
     names: Mapping[int, str]
@@ -71,8 +72,8 @@ def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
 class Predicted:
     """Costs of a split's samples by one predictor, centred by class: quantity to values of shape (N,)."""
 
-    costs: Mapping[str, Array]
-    stated: Mapping[str, Array]
+    costs: Mapping[str, Floats]
+    stated: Mapping[str, Floats]
     """Standard deviations by the predictor; 0 where it states none."""
 
     @classmethod
@@ -176,7 +177,7 @@ def make_column_name(quantity: str, part: str = "") -> str:
 
 
 def make_predictions_table(
-    sets: Mapping[str, Measured], said: Mapping[str, Mapping[str, Array]], spreads: Mapping[str, Mapping[str, Spread]]
+    sets: Mapping[str, Measured], said: Mapping[str, Mapping[str, Floats]], spreads: Mapping[str, Mapping[str, Spread]]
 ) -> pa.Table:
     """Return one row a labelled sample: label, prediction and stated errors; null without a prediction."""
     fields = [column.field() for column in _KEYS]
@@ -207,8 +208,8 @@ def make_predictions_table(
 
 
 def _iterate_parts(
-    found: Measured, said: Mapping[str, Array], spreads: Mapping[str, Spread], quantity: str
-) -> Iterator[Array | None]:
+    found: Measured, said: Mapping[str, Floats], spreads: Mapping[str, Spread], quantity: str
+) -> Iterator[Floats | None]:
     nothing = np.full(len(found.split), np.nan)
     yield from (found.costs[quantity], found.deviations[quantity], said.get(quantity, nothing))
     spread = spreads.get(quantity, Spread(nothing, nothing, nothing))
@@ -220,7 +221,7 @@ def find_main_cost(table: pa.Table) -> Literal["E", "T"]:
     return "E" if np.isfinite(to_floats(table, make_column_name("E", "predicted"))).any() else "T"
 
 
-def compute_cost_errors(table: pa.Table, quantity: str) -> Array:
+def compute_cost_errors(table: pa.Table, quantity: str) -> Floats:
     """Return predicted less measured values of a quantity, shape (N,)."""
     return to_floats(table, make_column_name(quantity, "predicted")) - to_floats(table, make_column_name(quantity))
 

@@ -30,13 +30,13 @@ from typing import Any, ClassVar, Protocol, TypeAlias, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeature, ExtraFeatures, read_extra_features
 from tcpipe.errors import ModelError
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes, compute_loss_factors, mean_loss
 
 Patches: TypeAlias = NDArray[np.float32]
-Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = NDArray[np.floating]
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeatures, standardize_features
 from tcpipe.errors import ModelError
@@ -37,8 +38,6 @@ from tcpipe.learning.physics_model import Curves, cross_fit_curves, fit_curves, 
 from tcpipe.learning.predictor import Fitted, Inputs, Job, Patches, Prediction, Predictor, Samples, require_folds
 from tcpipe.recipe import TrainConfig
 from tcpipe.terrain.layers import HEIGHT_RANGE_M
-
-Floats = NDArray[np.float64]
 
 _OF_GROUND, _OF_BAND, _OF_OTHERS = 6, 2, 3
 """Features of a channel."""

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.prediction_errors import FEWEST, NEAR, make_residuals
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import name_common_std
@@ -24,7 +25,7 @@ from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.published_outputs import find_newest
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes
-from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, compute_costs
+from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, compute_costs
 from tcpipe.learning.model_card import KIND, LayerRange, ModelCard, TrainedOn, Training, TrainingRange
 from tcpipe.learning.models import CARD, FILES, GROUND_COLUMNS, load_model, write_model
 from tcpipe.learning.own_models import load_own_kind, report_errors
@@ -96,7 +97,7 @@ def choose_kind(data: Dataset, config: FitConfig, split: Split | None = None) ->
     runs, folds = (np.unique(split.column(name), return_inverse=True)[1] for name in ("run_id", "fold"))
     part = runs % _PARTS if runs.any() else folds
     clusters = runs if runs.max() + 1 >= _PARTS else runs * (folds.max() + 1) + folds
-    losses: dict[ModelKind, Array] = {}
+    losses: dict[ModelKind, Floats] = {}
     for name in AUTOMATIC:
         kind = find_kind(name)
         try:
@@ -114,7 +115,7 @@ def choose_kind(data: Dataset, config: FitConfig, split: Split | None = None) ->
     return chosen
 
 
-def _compute_losses(samples: Samples, predicted: Array) -> Array:
+def _compute_losses(samples: Samples, predicted: Floats) -> Floats:
     """Return the squared errors of T and E over their variances, shape (N,)."""
     if len(samples.inputs.outputs) == 1:
         return np.asarray(np.square((predicted - samples.labels) / samples.labels.std())[:, 0])
@@ -126,7 +127,7 @@ def _compute_losses(samples: Samples, predicted: Array) -> Array:
     return np.asarray(np.sum(losses, axis=0))
 
 
-def is_within_error(difference: Array, clusters: NDArray[np.int64]) -> bool:
+def is_within_error(difference: Floats, clusters: NDArray[np.int64]) -> bool:
     """Return whether the mean of differences is no more than its standard error, whose clusters err alike."""
     sums = np.bincount(clusters, difference - difference.mean())
     count = int(np.unique(clusters).size)
@@ -289,7 +290,7 @@ def find_training_range(split: Split) -> TrainingRange:
     """Return classes and ranges of what a split holds."""
     pixel_classes: set[int] = set()
     reliefs_m: list[float] = []
-    means: dict[str, list[Array]] = {}
+    means: dict[str, list[Floats]] = {}
     for first in range(0, len(split), _READ_TOGETHER):
         layers = split.layers(np.arange(first, min(first + _READ_TOGETHER, len(split))))
         if "terrain" in layers:
@@ -381,7 +382,7 @@ def read_class_table(card: DatasetCard) -> ClassTable:
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
 
-def _find_middles(split: Split) -> Array:
+def _find_middles(split: Split) -> Floats:
     """Return longitude and latitude of the middle of each sample [deg], shape (N, 2); none of a dataset without coordinates."""
     return compute_middles([split.column(name) for name in PLACES]) if split.has_coordinates else np.empty((0, 2))
 

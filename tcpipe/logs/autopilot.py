@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_message_fields, utc_from_gps_ns
 from tcpipe.logs.fix_quality import Columns, classify_fixes, find_status
 from tcpipe.logs.messages import GNSS
@@ -21,9 +21,7 @@ from tcpipe.logs.topics import AutopilotKind
 from tcpipe.robots import UNMEASURED_AMP
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
-Int64 = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Stamped = tuple[Int64, Columns]
+Stamped = tuple[Ints, Columns]
 """Times since boot [µs], shape (N,), and fields by name."""
 LeverArms = dict[str, tuple[float, float, float]]
 
@@ -40,7 +38,7 @@ class Autopilot:
         """Return the names of all instances, the first first."""
         return sorted(found for found in self.messages if re.fullmatch(rf"{name}(_\d+)?", found))
 
-    def find_last(self, name: str, at_us: Int64, *, within_us: int) -> Columns:
+    def find_last(self, name: str, at_us: Ints, *, within_us: int) -> Columns:
         """Return the numbers of the last message of a name at or before each time, NaN where that is long ago; {} without any."""
         time_us, fields = self.messages.get(name, (None, {}))
         if time_us is None:
@@ -60,7 +58,7 @@ class RoleMessages:
 
     topic: str
     type_name: str
-    time_us: Int64
+    time_us: Ints
     columns: Columns
     frame: str
 
@@ -141,7 +139,7 @@ _FIRST_US, LATEST_US = 1_100_000_000 * 10**6, 4_000_000_000 * 10**6
 _RECEIVERS = "vehicle_gps_position sensor_gps GPS"
 
 
-def _find_receiver(log: Autopilot) -> tuple[str, Int64, Columns]:
+def _find_receiver(log: Autopilot) -> tuple[str, Ints, Columns]:
     """Return the name and messages of the first receiver; without any one message at time 0 that has no fields."""
     names = [found for name in _RECEIVERS.split() for found in log.list_instances(name)]
     return (names[0], *log.messages[names[0]]) if names else ("", np.zeros(1, np.int64), {})
@@ -161,14 +159,14 @@ _IN_3D, _RTK_FIXED = 3, 6
 """Types of fixes; those beyond are no measurements."""
 
 
-def _make_fix(log: Autopilot, kind: Int64, sea_m: Floats) -> Columns:
+def _make_fix(log: Autopilot, kind: Ints, sea_m: Floats) -> Columns:
     """Return quality and height of fixes: above the ellipsoid where that is logged; a fix in the plane has none."""
     ellipsoidal = _find_ellipsoidal(log)
     height = np.where(kind >= _IN_3D, sea_m if ellipsoidal is None else ellipsoidal, np.nan)
     return {"quality": _find_quality(kind), "altitude": height}
 
 
-def _find_quality(kind: Int64) -> Floats:
+def _find_quality(kind: Ints) -> Floats:
     return classify_fixes(np.where(kind > _RTK_FIXED, 0, kind), "mavlink")
 
 
@@ -182,7 +180,7 @@ def _turn_axes(name: str, forward: Floats, right: Floats, down: Floats) -> dict[
 
 
 # ---------------------------------------------------------------- PX4
-def _convert_px4_fix(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_px4_fix(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     if "latitude_deg" in f:
         lat, lon, sea = f["latitude_deg"], f["longitude_deg"], f["altitude_msl_m"]
     else:  # until 2023
@@ -191,33 +189,33 @@ def _convert_px4_fix(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> 
     return time_us, {"latitude": lat, "longitude": lon, **_make_fix(log, f["fix_type"], sea), **accuracy}
 
 
-def _convert_px4_velocity(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_px4_velocity(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     known = (f["vel_ned_valid"] != 0) & (f["fix_type"] >= _IN_3D)
     axes = {"east": f["vel_e_m_s"], "north": f["vel_n_m_s"], "up": -f["vel_d_m_s"]}
     values = {name: np.where(known, axis, np.nan) for name, axis in axes.items()}
     return time_us, values | {f"{name}_std": f["s_variance_m_s"] for name in axes}
 
 
-def _convert_px4_imu(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_px4_imu(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     unknown = f["accelerometer_timestamp_relative"] == np.iinfo(np.int32).max
     force = np.where(unknown[:, None], np.nan, f["accelerometer_m_s2"])
     return time_us, _turn_axes("angular_velocity", *f["gyro_rad"].T) | _turn_axes("linear_acceleration", *force.T)
 
 
-def _convert_px4_battery(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_px4_battery(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     voltage, current = f["voltage_v"], f["current_a"]
     drawn = np.where(np.isin(current, UNMEASURED_AMP["battery_status"]), np.nan, -current)  # negative in BatteryState
     return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
 
 
-def _convert_px4_wheels(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_px4_wheels(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     """Return the mean of both wheels: drivers do not agree which is the left one."""
     if "RDD_WHEEL_RADIUS" not in log.parameters:
         raise KeyError("a wheel radius (RDD_WHEEL_RADIUS)")
     return time_us, {"linear_x": f["wheel_speed"].mean(axis=1) * log.parameters["RDD_WHEEL_RADIUS"]}
 
 
-def _convert_px4_command(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_px4_command(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     speed = f[next((name for name in _PX4_SPEEDS if name in f), _PX4_SPEEDS[0])]
     turn = {**log.find_last("rover_rate_setpoint", time_us, within_us=_HELD_US), **f}
     right = next((turn[name] for name in ("yaw_rate_setpoint", "yaw_rate") if name in turn), 0.0 * speed)
@@ -229,7 +227,7 @@ _HELD_US = 1_000_000
 
 
 # ---------------------------------------------------------------- ArduPilot
-def _find_accuracy(log: Autopilot, name: str, time_us: Int64) -> Columns:
+def _find_accuracy(log: Autopilot, name: str, time_us: Ints) -> Columns:
     """Return the accuracies that are logged beside each fix."""
     return log.find_last(name.replace("GPS", "GPA"), time_us + _BESIDE_US, within_us=2 * _BESIDE_US)
 
@@ -237,14 +235,14 @@ def _find_accuracy(log: Autopilot, name: str, time_us: Int64) -> Columns:
 _BESIDE_US = 50_000
 
 
-def _convert_ardupilot_fix(log: Autopilot, name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_ardupilot_fix(log: Autopilot, name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     values = {"latitude": f["Lat"], "longitude": f["Lng"], **_make_fix(log, f["Status"], f["Alt"])}
     if accuracy := _find_accuracy(log, name, time_us):
         values |= {"east_std": accuracy["HAcc"], "north_std": accuracy["HAcc"], "up_std": accuracy["VAcc"]}
     return time_us, values
 
 
-def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     """Return the fields of GPSFix, which has speed and course; its errors are those of 95 per cent."""
     accuracy, unknown = _find_accuracy(log, name, time_us), np.full(len(time_us), np.nan)
     error = 2.0 * accuracy.get("SAcc", unknown)
@@ -254,19 +252,19 @@ def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Int64, f: Co
     return time_us, {**values, "status.status": status}
 
 
-def _convert_ardupilot_imu(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_ardupilot_imu(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     broken = (f.get("GH", 1) == 0) | (f.get("AH", 1) == 0)
     rate, force = ([np.where(broken, np.nan, f[f"{sensor}{axis}"]) for axis in "XYZ"] for sensor in ("Gyr", "Acc"))
     return time_us, _turn_axes("angular_velocity", *rate) | _turn_axes("linear_acceleration", *force)
 
 
-def _convert_ardupilot_battery(_log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_ardupilot_battery(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     scale = 1.0 if f["Volt"].dtype.kind == "f" else 0.01  # before 2015 in hundredths
     voltage, drawn = f["Volt"] * scale, f["Curr"] * -scale
     return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
 
 
-def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     """Return speed and turn between two messages from the distances of the wheels, stamped in the middle."""
     step_s = np.diff(time_us, prepend=np.nan) * 1e-6
     speed, right_m = list[Floats](), list[float]()
@@ -282,13 +280,13 @@ def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Int64, f: Col
     return time_us - np.nan_to_num(step_s * 5e5).astype(np.int64), {"linear_x": ahead, "angular_z": turn}
 
 
-def _convert_ardupilot_command(log: Autopilot, _name: str, time_us: Int64, f: Columns) -> tuple[Int64, Columns]:
+def _convert_ardupilot_command(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
     steering = log.find_last("STER", time_us, within_us=_HELD_US)
     turn = -np.radians(np.nan_to_num(steering.get("DesTurnRate", np.zeros(len(time_us)))))
     return time_us, {"linear_x": f["DesSpeed"], "angular_z": turn}
 
 
-_Convert = Callable[[Autopilot, str, Int64, Columns], tuple[Int64, Columns]]
+_Convert = Callable[[Autopilot, str, Ints, Columns], tuple[Ints, Columns]]
 _PX4_COMMANDS = """rover_speed_setpoint rover_differential_setpoint rover_ackermann_setpoint rover_mecanum_setpoint
 differential_drive_setpoint"""
 _TOPICS = {

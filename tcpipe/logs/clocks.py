@@ -19,11 +19,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints, Mask
 from tcpipe.tables.facts import ClockStep
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
-
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 SECOND_NS = 1_000_000_000
 FOLLOWS_NS = 10 * SECOND_NS

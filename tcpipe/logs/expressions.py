@@ -9,7 +9,8 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tcpipe.arrays import Floats
 
 _WORDS = """
 latitude: breite breitengrad latitud
@@ -45,7 +46,6 @@ def translate(name: str) -> str:
     return _FOREIGN.sub(lambda found: _ENGLISH[found[0].lower()], plain)
 
 
-Floats = NDArray[np.float64]
 Read = Callable[[str, int | None], Floats]
 """Returns a column's values, those of one element where it is a list."""
 

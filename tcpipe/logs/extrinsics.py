@@ -11,11 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.geometry.rotation import invert, multiply, normalize, rotate
-
-Floats = NDArray[np.float64]
 
 _SAME_M = 1e-6
 _SAME_QUAT = 1e-9

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.logs import roles
 from tcpipe.logs.expressions import (
     FORM,
@@ -32,7 +33,6 @@ from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity
 
-Floats = NDArray[np.float64]
 Array = NDArray[Any]
 Columns = Mapping[str, Array]
 

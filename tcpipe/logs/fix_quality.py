@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.logs.expressions import simplify_name
 
 Array = NDArray[Any]
 Columns = Mapping[str, Array]
-Floats = NDArray[np.float64]
 
 NO_HEIGHT_M2 = 1e6
 """Variance of a height that is not measured."""

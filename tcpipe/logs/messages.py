@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.geometry.rotation import normalize
 from tcpipe.logs import roles
 from tcpipe.logs.extrinsics import is_base
@@ -30,10 +31,6 @@ from tcpipe.logs.fix_quality import (
 from tcpipe.logs.nmea import add_date, read_gga, read_over_ground
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 LOG_TIME = "log_time_ns"
 GNSS, GNSS_VELOCITY = Subject("role", "gnss"), Subject("role", "gnss_velocity")

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from tcpipe.arrays import Floats, Ints
 
 NS_PER_DAY = 86_400_000_000_000
 

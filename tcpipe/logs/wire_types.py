@@ -16,6 +16,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.logs.topics import normalize_type_name
 
 MAX_COLUMNS = 20_000
@@ -200,8 +201,6 @@ def _parse_field_type(found: re.Match[str], owner: str) -> FieldType:
     return FieldType(name, limit, int(found["size"] or 0), fixed)
 
 
-Int64Array = NDArray[np.int64]
-
 _MAX_STEPS = 20_000
 """A walk of more steps is given up: a few endless lists among short ones are cheaper to read one by one."""
 _CDR_BYTE_ORDER = {0: ">", 1: "<", 6: ">", 7: "<"}
@@ -269,7 +268,7 @@ class Grid:
         found: NDArray[np.generic] = np.ndarray(self.shape, together, data, self.first, self.strides)
         return found.copy().reshape(-1).view(dtype)
 
-    def list_offsets(self) -> Int64Array:
+    def list_offsets(self) -> Ints:
         """Return all of them, the last axis first."""
         offsets = np.full(1, self.first, np.int64)
         for count, stride in zip(self.shape, self.strides, strict=True):
@@ -277,7 +276,7 @@ class Grid:
         return offsets
 
 
-Places = Int64Array | Grid
+Places = Ints | Grid
 """Where the M values of a field lie, as an array (M,) or a grid."""
 
 
@@ -294,7 +293,7 @@ class Runs:
     """``lengths`` bytes each, shape (M,), equal in a grid: scalars side by side, or a text (``dtype`` None)."""
 
     places: Places
-    lengths: Int64Array
+    lengths: Ints
     dtype: np.dtype[np.generic] | None
 
 
@@ -310,7 +309,7 @@ class Fields:
 class Lists:
     """M lists of ``counts`` elements each; ``elements`` are those of all lists, one list after the other."""
 
-    counts: Int64Array
+    counts: Ints
     elements: Values
 
 
@@ -325,9 +324,7 @@ class WalkResult:
     fits: NDArray[np.bool_]
 
 
-def walk(
-    message: Record, data: NDArray[np.uint8], starts: Int64Array, ends: Int64Array, dialect: Dialect
-) -> WalkResult:
+def walk(message: Record, data: NDArray[np.uint8], starts: Ints, ends: Ints, dialect: Dialect) -> WalkResult:
     """Find every field of every message; `RaggedError` where they are so unlike that they are cheaper to read one by one.
 
     Each begins and ends in ``data`` at ``starts`` and ``ends``, shape (N,), rising.
@@ -347,7 +344,7 @@ def walk(
     return WalkResult(None, np.zeros(len(starts), np.bool_))
 
 
-def _find_grid(bases: Int64Array, sizes: Int64Array) -> Places:
+def _find_grid(bases: Ints, sizes: Ints) -> Places:
     """Return bases as a grid where messages of one size lie at equal distances."""
     steps = np.diff(bases)
     if (sizes != sizes[0]).any() or (steps != steps[:1]).any():
@@ -361,7 +358,7 @@ class _Cursors:
     While ``_bases`` is a grid, messages have one size, ``_at`` is the position in all of them, and one that does not fit is an error.
     """
 
-    def __init__(self, data: NDArray[np.uint8], bases: Places, sizes: Int64Array, dialect: Dialect) -> None:
+    def __init__(self, data: NDArray[np.uint8], bases: Places, sizes: Ints, dialect: Dialect) -> None:
         self._data, self._bases, self._sizes, self._dialect = data, bases, sizes, dialect
         self._at, self._steps = 0, 0
         self._positions, self._good = np.zeros(len(sizes), np.int64), sizes >= 0
@@ -375,7 +372,7 @@ class _Cursors:
         finished: NDArray[np.bool_] = self._good & (left >= 0) & (left <= self._dialect.padding)
         return finished
 
-    def values(self, wire_type: WireType, rows: Int64Array) -> Values:
+    def values(self, wire_type: WireType, rows: Ints) -> Values:
         """Step over one value in each of the ``rows``: all messages, none, or some of those without a grid."""
         self._steps += 1
         if self._steps > _MAX_STEPS:
@@ -393,12 +390,12 @@ class _Cursors:
             case Array():
                 return self.array(wire_type, rows)
 
-    def record(self, record: Record, rows: Int64Array) -> Fields:
+    def record(self, record: Record, rows: Ints) -> Fields:
         if not record.fields:  # CDR has no empty structures: rosidl puts one byte there
             self.take(rows, self._dialect.empty_record_bytes, 1)
         return Fields(len(rows), tuple(self.values(field, rows) for _, field in record.fields))
 
-    def array(self, array: Array, rows: Int64Array) -> Values:
+    def array(self, array: Array, rows: Ints) -> Values:
         counts = self.count(rows) if array.length is None else array.length
         if isinstance(self._bases, Grid) and len(rows):
             if counts > self._sizes[0] - self._at:  # an element takes a byte at least
@@ -415,7 +412,7 @@ class _Cursors:
         each = np.broadcast_to(counts, len(rows))
         return Lists(each, self.regular(array.element, rows, each) or self.elements(array.element, rows, each))
 
-    def elements(self, element: Text | Record, rows: Int64Array, counts: Int64Array) -> Values:
+    def elements(self, element: Text | Record, rows: Ints, counts: Ints) -> Values:
         """Step over the first elements of all lists, then over the second ones, and so on."""
         if not counts.any():
             return self.values(element, rows[:0])
@@ -429,7 +426,7 @@ class _Cursors:
         order[np.concatenate(places)] = np.arange(len(order))
         return _join_values(pieces, order)
 
-    def regular(self, element: Text | Record, rows: Int64Array, counts: Int64Array) -> Values | None:
+    def regular(self, element: Text | Record, rows: Ints, counts: Ints) -> Values | None:
         """Step over all elements at once where each takes the same room wherever it stands; None where they do not."""
         size, stride, alignment = _find_regular_size(element, self._dialect.max_alignment)
         if not size or counts.max(initial=0) < 2:
@@ -448,7 +445,7 @@ class _Cursors:
         total = int(counts.sum())
         return _Cursors(self._data, places, np.full(total, size), self._dialect).values(element, np.arange(total))
 
-    def count(self, rows: Int64Array) -> int | Int64Array:
+    def count(self, rows: Ints) -> int | Ints:
         """Step over a length in each row; return them, as one number where all messages have the same."""
         places, dtype = self.take(rows, 4, 4), np.dtype(self._dialect.byte_order + "u4")
         if isinstance(places, Grid):
@@ -463,7 +460,7 @@ class _Cursors:
         found[good] = self._counts[places[good]].view(dtype)
         return found
 
-    def take(self, rows: Int64Array, sizes: int | Int64Array, alignment: int | Int64Array) -> Places:
+    def take(self, rows: Ints, sizes: int | Ints, alignment: int | Ints) -> Places:
         """Move over ``sizes`` bytes after alignment; return where they begin."""
         if not len(rows):
             return rows
@@ -474,7 +471,7 @@ class _Cursors:
                 raise LayoutError(f"byte {begin + sizes}")
             self._at = int(begin + sizes)
             return Grid(self._bases.first + begin, self._bases.shape, self._bases.strides)
-        offsets: Int64Array = (self._positions[rows] + mask) & ~mask
+        offsets: Ints = (self._positions[rows] + mask) & ~mask
         after = offsets + sizes
         past = after > self._sizes[rows]
         if past.any():
@@ -484,11 +481,11 @@ class _Cursors:
         return offsets + self._bases[rows]
 
 
-def _list_offsets(places: Places) -> Int64Array:
+def _list_offsets(places: Places) -> Ints:
     return places.list_offsets() if isinstance(places, Grid) else places
 
 
-def _join_values(pieces: Sequence[Values], order: Int64Array) -> Values:
+def _join_values(pieces: Sequence[Values], order: Ints) -> Values:
     """Concatenate values and put them in order: the n-th is number ``order[n]`` of the concatenation."""
     match pieces[0]:
         case Scalars(dtype=dtype):

@@ -16,12 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.motion.row_sections import find_piece_spans, find_runs
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 def find_kept_spans(dropped_by: NDArray[np.uint32], piece: Ints) -> Ints:

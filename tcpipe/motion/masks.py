@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Mask
 from tcpipe.motion.row_sections import (
-    Floats,
-    Mask,
     MotionRows,
     compute_window_mean,
     dilate_mask,

@@ -8,12 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from tcpipe.arrays import Floats, Ints, Mask
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tcpipe.motion.row_sections import Floats, Ints, MotionRows, find_piece_bounds
+from tcpipe.arrays import Floats, Ints
+from tcpipe.motion.row_sections import MotionRows, find_piece_bounds
 from tcpipe.tables.facts import FuseFacts
 
 

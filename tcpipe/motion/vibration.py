@@ -15,7 +15,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from tcpipe.arrays import Floats
+
 Stamps = NDArray[np.int64]
 
 LOW_HZ, HIGH_HZ = 3.0, 20.0

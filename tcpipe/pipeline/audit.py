@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.errors import FusionError, UsageError, clean_lines
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
@@ -36,8 +36,6 @@ from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.store import find_named_run, is_path, is_store
 from tcpipe.tables.columns import number_column, read_float_columns, select_rows, to_integers
 from tcpipe.tables.levels import Streams, Track
-
-Ints = NDArray[np.int64]
 
 WINDOWS_S = (10.0, 30.0, 60.0)
 """Lengths of the windows without fixes [s]."""

@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints, Mask
 from tcpipe.errors import clean_lines
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, RecordChange, compare_records, format_value
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches, read_card, read_samples, sample_columns
@@ -27,9 +28,6 @@ _LABELLED = (*_LABELS, "fused_velocity_mps", *_STDS)
 _DRAWN = ("split", "fold")
 _SHARED = 0.9
 """Smallest shared fraction of the time of two samples that are compared."""
-
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints, Mask
 from tcpipe.cost.labels import find_wanted_rate, is_too_slow
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.logs.message_tables import TableLog
@@ -28,9 +28,6 @@ from tcpipe.stages.read import decide_roles, find_read_config
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import ABSENT, ClockStep
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
-
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _GAP_PERIODS, _GAP_NS = 3, 300_000_000
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.errors import LogError, StoreError, UsageError, clean_lines
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
@@ -41,8 +42,6 @@ _LABELS = (
 _ROS_TYPES = {
     pa.float64(): "float64", pa.int64(): "int64", pa.int32(): "int32", pa.int16(): "int16", pa.uint32(): "uint32", pa.string(): "string",
 }  # fmt: skip
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

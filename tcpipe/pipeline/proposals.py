@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import LogError, TcpipeError, UsageError, clean_line
 from tcpipe.formats.finding_lines import describe_finding, format_number
 from tcpipe.formats.logs.log_file import list_logs_below
@@ -235,7 +235,6 @@ def _describe_sample(columns: Columns, topic: Topic, role: str) -> str:
     return count + "".join(f", {name} {format_first(columns[message])}" for name, message in shown[-3:])
 
 
-Floats = NDArray[np.float64]
 _Values: TypeAlias = dict[str, tuple[TomlValue, str, bool]]
 """By key of a table of the recipe its value, a note, and whether it is certain."""
 _STAMP = re.compile(

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats32, Mask
 from tcpipe.errors import MapError
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_model import BATCH, NO_COST, Bits, Reason, SegmentPredictions, iterate_predictions
@@ -76,7 +77,6 @@ def find_crossed_cells(course: int) -> tuple[CrossedCell, ...]:
     return CrossedCell(0, 0, 0.25), middle, CrossedCell(side_e, side_n, 0.25), CrossedCell(east, north, 0.25)
 
 
-Floats32 = NDArray[np.float32]
 Classes = NDArray[np.uint8]
 Cells = NDArray[np.int64]
 
@@ -220,9 +220,6 @@ class CellFrames:
         (north_west, north_east), (south_west, south_east) = self._corners
         ground = (1 - v) * ((1 - u) * north_west + u * north_east) + v * ((1 - u) * south_west + u * south_east)
         return np.asarray(np.linalg.norm(DIRECTIONS @ ground.T, axis=1))
-
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats32
 from tcpipe.cost.prediction_errors import Errors
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, lock_directory, make_scratch_directory, write_text
@@ -58,7 +59,6 @@ from tcpipe.terrain.target_grid import MapGrid
 
 logger = logging.getLogger("tcpipe")
 
-Floats32 = NDArray[np.float32]
 
 Step: TypeAlias = Callable[[int, int], None]
 

@@ -15,6 +15,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.prediction_errors import fit_bias_correction, propagate_stated
 from tcpipe.dataset.extra_features import ExtraFeatures
 from tcpipe.errors import ModelError
@@ -31,8 +32,6 @@ from tcpipe.terrain.sampling import (
     sample_patches,
 )
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level
-
-Floats = NDArray[np.float64]
 
 
 def check_model(model: Model, source: MapReader, *, needs_energy: bool = True) -> None:

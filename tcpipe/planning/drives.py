@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.cost.adaptation import Metres, Run, predict
@@ -39,8 +38,6 @@ from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import PREDICTED, Finding, Subject, Verdict, judge, make_finding, read_threshold
 from tcpipe.terrain.sampling import make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
-
-Floats = NDArray[np.float64]
 
 UNCERTAIN, UNLABELLED = "position_uncertain", "no_label"
 """Reasons against the comparison of a segment, besides `Reason`."""

@@ -11,13 +11,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import UsageError
 from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import MapReader, find_map_projection
-
-Floats = NDArray[np.float64]
 
 _FARTHEST_ORIGIN_M = 100_000.0
 """From the map. A frame that begins further away has its longitude and latitude exchanged, or is of another site."""

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from pyarrow import csv
 from pyproj import Geod
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.adaptation import Adapted, Metres, Run, adapt, predict
 from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution
 from tcpipe.errors import ModelError, PathError, UsageError
@@ -37,8 +37,6 @@ from tcpipe.tables.findings import LEFT_OUT
 from tcpipe.terrain.projection import compute_area, make_metres_from_plane
 from tcpipe.terrain.sampling import PatchFrames, compute_footprints, count_corners_on, make_patch_frames
 from tcpipe.terrain.tiles import MapReader
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

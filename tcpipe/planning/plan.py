@@ -19,10 +19,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Mask
 from tcpipe.cost.prediction_errors import Errors
 from tcpipe.errors import ModelError, PathError
 from tcpipe.formats.json_files import convert_record
-from tcpipe.planning.cost_grid import BARRED, COURSES, LazyCostGrid, Mask
+from tcpipe.planning.cost_grid import BARRED, COURSES, LazyCostGrid
 from tcpipe.planning.cost_model import Reason
 from tcpipe.planning.frames import find_projection
 from tcpipe.planning.path_cost import PathCost, PathTotals, compute_path_cost, describe_off_map
@@ -41,7 +42,6 @@ from tcpipe.terrain.sampling import find_classes_at
 
 logger = logging.getLogger("tcpipe")
 
-Floats = NDArray[np.float64]
 Classes = NDArray[np.uint8]
 Objective = Literal["energy", "time", "distance"]
 

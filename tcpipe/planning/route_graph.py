@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tcpipe.errors import PathError, UsageError, clean_lines
 from tcpipe.formats.finding_lines import format_findings
@@ -20,8 +19,6 @@ from tcpipe.planning.cost_model import check_model
 from tcpipe.planning.frames import make_frame
 from tcpipe.planning.path_cost import PathCost, compute_path_cost
 from tcpipe.tables.findings import Subject, make_finding
-
-Floats = NDArray[np.float64]
 
 _SHORTEST_M = 0.01
 

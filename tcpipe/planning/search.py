@@ -26,14 +26,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.compiled import compile_kernel
 from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.planning.cost_grid import ANGLES_DEG, COURSES, MOVES, CostGrid, find_crossed_cells
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.layers import ClassTable
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Classes = NDArray[np.uint8]
 
 _LEAST = 1e-9

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.power.rails import Rail, interpolate_rail
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
 
-Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 _WINDOW_S = 10.0

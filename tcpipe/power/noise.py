@@ -17,14 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Mask
 from tcpipe.power.rails import Rail, SampledSignal, interpolate_rail, sum_power
 from tcpipe.power.sampling import estimate_smoothing_variance
 from tcpipe.robust import solve_non_negative
 from tcpipe.tables.facts import Smoothing
 
-Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _NS = 1e-9
 

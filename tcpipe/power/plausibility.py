@@ -7,13 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Mask
 from tcpipe.robots import UNMEASURED_AMP
 from tcpipe.tables.findings import read_threshold
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 EXCLUDED, REJECTED = "power-values-excluded", "power-rejected"
 _FEWEST_VALUES, _MARKS, _MOST_REPEATS = 20, 2, 5

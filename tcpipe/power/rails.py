@@ -22,9 +22,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.geometry.piecewise_linear import integrate_held_to, integrate_product_to, interpolate
 
-Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 _PERIODS = 3
@@ -153,8 +153,6 @@ def _is_near_samples(stamp_ns: Stamps, at_ns: Stamps, max_gap_ns: int) -> NDArra
     width = stamp_ns[np.minimum(after, last)] - stamp_ns[np.maximum(before, 0)]
     return np.asarray((before >= 0) & (after <= last) & (width <= longest))
 
-
-Ints = NDArray[np.int64]
 
 Rule = Literal["exact", "averaged", "right_endpoint"]
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from tcpipe.arrays import Floats
 from tcpipe.power.audit import measure_sag
 from tcpipe.power.plausibility import EXCLUDED, REJECTED, find_isolated, find_missing_rows, undo_overflow
 from tcpipe.power.rails import UNIT_VOLT, is_power_only, make_rail, make_samples
@@ -15,7 +16,6 @@ from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
     Columns,
-    Floats,
     HuskyPower,
     JointPower,
     RailReadings,

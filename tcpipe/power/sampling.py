@@ -20,11 +20,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.power.rails import Rail, Rule, SampledSignal, integrate_energy
 from tcpipe.tables.facts import Smoothing
 from tcpipe.tables.findings import read_threshold
 
-Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 _FEWEST_INTERVALS = 20

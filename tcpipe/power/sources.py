@@ -21,13 +21,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.power.plausibility import REJECTED
 from tcpipe.power.rails import UNIT_VOLT, is_power_only
 from tcpipe.robots import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 Columns = Mapping[str, NDArray[Any]]
-Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 HuskyPower = Literal["battery", "drivers"]
 

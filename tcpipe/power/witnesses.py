@@ -19,10 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import WITNESSES_OF_LABEL, Finding, Severity, Subject, make_finding, read_threshold
-
-Floats = NDArray[np.float64]
 
 IMPLAUSIBLE = "power-implausible"
 _GRAVITY_MPS2 = 9.80665

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial import cKDTree
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_card import LOCAL, DatasetCard, group_dataset_findings, judge_dataset
 from tcpipe.formats.dataset_files import read_intact_card, read_samples, sample_columns
@@ -58,8 +59,6 @@ SAMPLE_COLUMNS = (
     *(column for *columns, _ in LABELS.values() for column in columns),
 )
 """Columns of samples.parquet that the page needs, those that the dataset has."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

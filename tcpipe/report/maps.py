@@ -12,6 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import StoreError, TcpipeError, clean_line
 from tcpipe.formats.dataset_card import LOCAL, DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, OVERVIEW, RELIEF
@@ -33,7 +34,6 @@ from tcpipe.store import Store
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.terrain.layers import TerrainClass
 
-Floats = NDArray[np.float64]
 Pictures = Mapping[str, str]
 """Pictures of a map by name, as data URIs; the first is visible."""
 

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.json_files import Json
 from tcpipe.geometry.datum import enu_from_geodetic
@@ -19,9 +19,6 @@ from tcpipe.report.plots import Plot, add_cursor, make_plot, show_text
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.columns import to_floats, to_integers, to_texts
 from tcpipe.tables.findings import Finding
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MOST_VALUES = 80_000
 """Most values of a series on the page; longer series are thinned."""

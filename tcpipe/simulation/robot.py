@@ -10,8 +10,9 @@ from dataclasses import astuple, dataclass, field
 
 import numpy as np
 
+from tcpipe.arrays import Floats
 from tcpipe.compiled import compile_kernel
-from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED, Float, World
+from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED, World
 from tcpipe.tables.facts import ABSENT
 
 GRAVITY_MPS2 = 9.80665
@@ -79,24 +80,24 @@ class SimulatedRobot:
     wheels: Wheels | None = field(default=None, metadata=ABSENT)
     """None: the ground under the robot's middle counts, and its bumps and slope across cost nothing."""
 
-    def ground_table(self) -> Float:
+    def ground_table(self) -> Floats:
         """Return speed, slip and rolling resistance by class id, shape (256, 3)."""
         table = np.tile(astuple(self.ground[GRASS]), (256, 1))
         table[list(self.ground)] = [astuple(ground) for ground in self.ground.values()]
         return table
 
-    def speed_factor(self, flat_speed: Float, sin_slope: Float) -> Float:
+    def speed_factor(self, flat_speed: Floats, sin_slope: Floats) -> Floats:
         """Return wheel speed over commanded speed, from the class's flat value and the sine of the slope along travel."""
         return flat_speed * (1.0 - self.uphill_slowdown * np.maximum(sin_slope, 0.0) / _STEEPEST_SIN)
 
-    def slip(self, flat_slip: Float, sin_slope: Float) -> Float:
+    def slip(self, flat_slip: Floats, sin_slope: Floats) -> Floats:
         """Return 1 - ground speed / wheel speed; gravity pulls the robot back uphill and on downhill."""
         return flat_slip + self.slope_slip * sin_slope / _STEEPEST_SIN
 
     def wheel_power_watt(
-        self, *, wheel_velocity_mps: Float, acceleration_mps2: Float, yaw_rate_radps: Float, slope_rad: Float,
-        rolling_resistance: Float,
-    ) -> Float:  # fmt: skip
+        self, *, wheel_velocity_mps: Floats, acceleration_mps2: Floats, yaw_rate_radps: Floats, slope_rad: Floats,
+        rolling_resistance: Floats,
+    ) -> Floats:  # fmt: skip
         """Return mechanical power at the wheels [W]; negative where the slope drives them."""
         direction = np.sign(wheel_velocity_mps)
         weight = self.mass_kg * GRAVITY_MPS2
@@ -106,13 +107,13 @@ class SimulatedRobot:
         scrub = self.scrub_torque_nm * np.abs(yaw_rate_radps) / (1.0 + radius_m / self.scrub_half_radius_m)
         return force * wheel_velocity_mps + scrub
 
-    def propulsion_watt(self, wheel_power_watt: Float, wheel_velocity_mps: Float) -> Float:
+    def propulsion_watt(self, wheel_power_watt: Floats, wheel_velocity_mps: Floats) -> Floats:
         """Return the electrical power of both motor drivers [W], negative when they give back."""
         friction = self.drivetrain_loss_newton * np.abs(wheel_velocity_mps) / self.drive_efficiency
         gain = np.where(wheel_power_watt > 0.0, 1.0 / self.drive_efficiency, self.regeneration_efficiency)
         return self.idle_watt + friction + wheel_power_watt * gain
 
-    def battery(self, propulsion_watt: Float, *, dt_s: float) -> tuple[Float, Float]:
+    def battery(self, propulsion_watt: Floats, *, dt_s: float) -> tuple[Floats, Floats]:
         """Return terminal voltage [V] and propulsion current [A] whose product is ``propulsion_watt``.
 
         Solves U² - U0·U + R·P = 0 for the total power P; U0 falls with the energy drawn so far.
@@ -126,9 +127,9 @@ class SimulatedRobot:
 
 @compile_kernel
 def drive_along(  # noqa: PLR0917 - numba takes positional arguments
-    grid_m: float, speed_factor: Float, slip: Float, map_per_surface: Float, command_mps: float, brake_at_m: float,
+    grid_m: float, speed_factor: Floats, slip: Floats, map_per_surface: Floats, command_mps: float, brake_at_m: float,
     time_constant_s: float, max_acceleration_mps2: float, dt_s: float, max_steps: int,
-) -> tuple[Float, Float, int]:  # fmt: skip
+) -> tuple[Floats, Floats, int]:  # fmt: skip
     """Drive one path from rest to rest; returns path position [m], wheel speed [m/s] at every step, and the number of steps.
 
     The arrays hold the ground along the path every ``grid_m`` map metres. Wheel speed follows command times ``speed_factor`` with a
@@ -158,7 +159,7 @@ def drive_along(  # noqa: PLR0917 - numba takes positional arguments
 
 
 @compile_kernel
-def make_correlated_noise(white: Float, correlation: float) -> Float:
+def make_correlated_noise(white: Floats, correlation: float) -> Floats:
     """Return a first-order Gauss-Markov series of unit variance from white noise; ``correlation`` is that of neighbours."""
     out, gain = white.copy(), np.sqrt(1.0 - correlation * correlation)
     for i in range(1, white.size):
@@ -166,11 +167,13 @@ def make_correlated_noise(white: Float, correlation: float) -> Float:
     return out
 
 
-Heading = tuple[Float, Float]
+Heading = tuple[Floats, Floats]
 """Cosine and sine of the direction from the map's x axis."""
 
 
-def compute_rolling_resistance(world: World, robot: SimulatedRobot, x: Float, y: Float, yaw_map_rad: Float) -> Float:
+def compute_rolling_resistance(
+    world: World, robot: SimulatedRobot, x: Floats, y: Floats, yaw_map_rad: Floats
+) -> Floats:
     """Return the traction force over the normal force at poses in the map, any shapes that broadcast.
 
     Without `Wheels` it is the mean along the wheelbase, under the middle; with them the mean of four contacts.
@@ -190,7 +193,7 @@ def compute_rolling_resistance(world: World, robot: SimulatedRobot, x: Float, y:
     return np.asarray(np.mean(found, axis=0) + drag)
 
 
-def _evaluate_at_contact(world: World, robot: SimulatedRobot, x: Float, y: Float, heading: Heading) -> Float:
+def _evaluate_at_contact(world: World, robot: SimulatedRobot, x: Floats, y: Floats, heading: Heading) -> Floats:
     cos, sin = heading
     classes = world.terrain_class(x, y)
     usual = robot.ground_table()[:, 2][classes] * world.resistance_factor(x, y)
@@ -202,7 +205,7 @@ def _evaluate_at_contact(world: World, robot: SimulatedRobot, x: Float, y: Float
     return np.asarray(usual + 0.5 * robot.wheels.bump_loss * np.abs(higher - lower) / robot.wheels.contact_m)
 
 
-def _compute_side_drag(world: World, wheels: Wheels, x: Float, y: Float, heading: Heading) -> Float:
+def _compute_side_drag(world: World, wheels: Wheels, x: Floats, y: Floats, heading: Heading) -> Floats:
     """Return the drag of running sidelong: of a side force sin(slope across) at the slip angle that gives it."""
     rise_x, rise_y = world.gradient(x, y)
     across = rise_y * heading[0] - rise_x * heading[1]

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import UsageError
 from tcpipe.geometry.rotation import invert, multiply, quat_from_matrix, rotation_vector_from_quat
 from tcpipe.simulation.robot import SimulatedRobot, compute_rolling_resistance, drive_along, make_correlated_noise
 from tcpipe.simulation.truth import Truth
-from tcpipe.simulation.world import GRASS, Band, Float, World
+from tcpipe.simulation.world import GRASS, Band, World
 
 PATH_GRID_M = 0.01
 _SMOOTH_M = 0.5
@@ -77,13 +78,13 @@ class Path:
     length_m: float
     stop_m: float
 
-    def at(self, s_m: Float) -> tuple[Float, Float]:
+    def at(self, s_m: Floats) -> tuple[Floats, Floats]:
         """Return positions, shape (N, 2), and tangent directions from the map's x axis [rad]."""
         tangent = self.curve(s_m, 1)
         return self.curve(s_m), np.arctan2(tangent[:, 1], tangent[:, 0])
 
 
-def make_leg_path(start_m: Float, leg: Leg, *, weave: tuple[Float, Float, Float], weave_m: float) -> Path:
+def make_leg_path(start_m: Floats, leg: Leg, *, weave: tuple[Floats, Floats, Floats], weave_m: float) -> Path:
     """Return the curve of ``leg`` from ``start_m``, shape (2,), in the coordinates of its waypoints.
 
     ``weave`` holds wavelengths [m], phases [rad] and weights of the sideways weaving, of total amplitude ``weave_m``.
@@ -104,18 +105,18 @@ def make_leg_path(start_m: Float, leg: Leg, *, weave: tuple[Float, Float, Float]
     return Path(CubicSpline(arc, points[::10]), float(arc[-1]), stop_m)
 
 
-def make_straight_path(start_m: Float, direction_rad: float, distance_m: float) -> Path:
+def make_straight_path(start_m: Floats, direction_rad: float, distance_m: float) -> Path:
     """Return a straight path that should be stopped on after ``distance_m``."""
     s = np.linspace(0.0, distance_m + _RUN_OUT_M, 8)
     points = start_m + s[:, None] * np.array([np.cos(direction_rad), np.sin(direction_rad)])
     return Path(CubicSpline(s, points), float(s[-1]), distance_m)
 
 
-def _integrate(values: Float) -> Float:
+def _integrate(values: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(values[:-1] + values[1:]) * PATH_GRID_M / 2])
 
 
-def _compute_curvature(corners: Float, radius_m: float) -> tuple[Float, float]:
+def _compute_curvature(corners: Floats, radius_m: float) -> tuple[Floats, float]:
     """Return the smoothed curvature every PATH_GRID_M, run-out included, and the length up to the last corner."""
     steps = np.diff(corners, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
@@ -135,7 +136,7 @@ def _compute_curvature(corners: Float, radius_m: float) -> tuple[Float, float]:
     return compute_moving_average(compute_moving_average(np.concatenate(pieces), _SMOOTH_M), _SMOOTH_M), straight_m
 
 
-def compute_moving_average(values: Float, window_m: float) -> Float:
+def compute_moving_average(values: Floats, window_m: float) -> Floats:
     """Return the centred mean over ``window_m`` of values given every PATH_GRID_M; ends are held."""
     half = max(round(window_m / PATH_GRID_M / 2), 1)
     padded = np.concatenate([np.full(half, values[0]), values, np.full(half, values[-1])])
@@ -229,8 +230,8 @@ class Wander:
         return plan
 
     def _next(
-        self, world: World, rng: np.random.Generator, here: Float, direction: float | None, done: Float
-    ) -> Float | None:
+        self, world: World, rng: np.random.Generator, here: Floats, direction: float | None, done: Floats
+    ) -> Floats | None:
         """Choose the best of many random next waypoints, and count its classes into ``done``; None if none is allowed."""
         count, points = 192, 40
         turn = rng.normal(0.0, 0.6, count) if direction is not None else rng.uniform(-np.pi, np.pi, count)
@@ -253,7 +254,7 @@ class Wander:
         done += length[best] * np.bincount(classes[best], minlength=256) / points
         return np.array([u[best, -1], v[best, -1]])
 
-    def _allowed(self, world: World, u: Float, v: Float) -> tuple[NDArray[np.bool_], NDArray[np.uint8], Float]:
+    def _allowed(self, world: World, u: Floats, v: Floats) -> tuple[NDArray[np.bool_], NDArray[np.uint8], Floats]:
         """Return which lines may be driven, the classes along them, and how steep they are on the whole (1: the steepest allowed)."""
         site, margin = world.site, self.margin_m
         west, east = self.x_range_m or (margin, site.width_m - margin)
@@ -278,12 +279,12 @@ _DIGGING_RESISTANCE = 0.3
 class _Stretch:
     """One manoeuvre, sampled: position in the map from the site's corner, direction in the map, wheel speed, slip, commands."""
 
-    uv_m: Float
-    yaw_map_rad: Float
-    wheel_mps: Float
-    slip: Float
-    command_mps: Float
-    command_radps: Float
+    uv_m: Floats
+    yaw_map_rad: Floats
+    wheel_mps: Floats
+    slip: Floats
+    command_mps: Floats
+    command_radps: Floats
 
 
 def simulate_drive(
@@ -309,7 +310,7 @@ def simulate_drive(
 
 
 def _plan_stretches(
-    world: World, manoeuvre: Manoeuvre, place: Float, yaw: float, *,
+    world: World, manoeuvre: Manoeuvre, place: Floats, yaw: float, *,
     robot: SimulatedRobot, weave_m: float, rng: np.random.Generator,
 ) -> list[_Stretch]:  # fmt: skip
     match manoeuvre:
@@ -335,7 +336,7 @@ def _plan_stretches(
 
 
 def _make_halt(
-    place: Float, yaw: float, duration_s: float, *, wheel_mps: float = 0.0, command_mps: float = 0.0
+    place: Floats, yaw: float, duration_s: float, *, wheel_mps: float = 0.0, command_mps: float = 0.0
 ) -> _Stretch:
     count = max(round(duration_s / _DT_S), 1)
     t = np.arange(count) * _DT_S
@@ -344,7 +345,7 @@ def _make_halt(
     return _Stretch(np.tile(place, (count, 1)), np.full(count, yaw), wheel, slip, np.full(count, command_mps), zero)
 
 
-def _turn(place: Float, yaw: float, angle_rad: float, robot: SimulatedRobot) -> _Stretch:
+def _turn(place: Floats, yaw: float, angle_rad: float, robot: SimulatedRobot) -> _Stretch:
     """Turn with a trapezoid of yaw rate that ends exactly at the angle."""
     rate, rise_s = robot.max_yaw_rate_radps, 0.35
     size = abs(angle_rad)
@@ -425,7 +426,7 @@ def _make_truth(
     )  # fmt: skip
 
 
-def _compute_tangent_pose(yaw_rad: Float, rise_east: Float, rise_north: Float) -> Float:
+def _compute_tangent_pose(yaw_rad: Floats, rise_east: Floats, rise_north: Floats) -> Floats:
     """Return enu_from_base_link: x looks along the yaw on the surface, z along its normal."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     forward = np.stack([c, s, rise_east * c + rise_north * s], axis=-1)
@@ -435,7 +436,7 @@ def _compute_tangent_pose(yaw_rad: Float, rise_east: Float, rise_north: Float) -
     return quat_from_matrix(np.stack([forward, np.cross(up, forward), up], axis=-1))
 
 
-def _compute_angular_velocity(quat_xyzw: Float) -> Float:
+def _compute_angular_velocity(quat_xyzw: Floats) -> Floats:
     """Return the body rates [rad/s] by central differences on the rotation group."""
     before = np.concatenate([quat_xyzw[:1], quat_xyzw[:-1]])
     after = np.concatenate([quat_xyzw[1:], quat_xyzw[-1:]])
@@ -445,8 +446,8 @@ def _compute_angular_velocity(quat_xyzw: Float) -> Float:
 
 
 def _compute_power(
-    robot: SimulatedRobot, driven: _Stretch, slope: Float, rolling: Float, rng: np.random.Generator
-) -> tuple[Float, Float, Float]:
+    robot: SimulatedRobot, driven: _Stretch, slope: Floats, rolling: Floats, rng: np.random.Generator
+) -> tuple[Floats, Floats, Floats]:
     """Return voltage, propulsion current, and the right driver's share of it."""
     rolling = np.where(driven.slip == 1.0, _DIGGING_RESISTANCE, rolling)
     noise = make_correlated_noise(rng.standard_normal(slope.size), float(np.exp(-_DT_S / robot.resistance_noise_s)))

@@ -15,10 +15,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.geometry.rotation import invert, multiply, quat_from_rotation_vector, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.simulation.robot import GRAVITY_MPS2, make_correlated_noise
 from tcpipe.simulation.truth import Truth
-from tcpipe.simulation.world import Float, Site
+from tcpipe.simulation.world import Site
 
 CLOCK_STEP_NS = 2_500_000_000
 """How far header stamps jump with the fault ``clock_step``."""
@@ -91,7 +92,7 @@ class Mounting:
     xyz_m: Triple = (0.0, 0.0, 0.0)
     rpy_rad: Triple = (0.0, 0.0, 0.0)
 
-    def quat_xyzw(self) -> Float:
+    def quat_xyzw(self) -> Floats:
         """Return base_link_from_sensor as a quaternion."""
         return np.asarray(quat_from_rpy(*self.rpy_rad))
 
@@ -306,13 +307,13 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
     return replace(said, stamp_ns=said.stamp_ns + np.round(1e9 * jitter_s).astype(np.int64)[row])
 
 
-def _draw_lasting_noise(sensor: Gnss, rng: np.random.Generator) -> tuple[Float, float]:
+def _draw_lasting_noise(sensor: Gnss, rng: np.random.Generator) -> tuple[Floats, float]:
     """Return size [m], shape (3,), and correlation time [s] of the lasting part of one drive's noise."""
     std_m, lasts_s = rng.uniform(*sensor.lasting_std_m), np.exp(rng.uniform(*np.log(sensor.lasts_s)))
     return std_m * np.array([1.0, 1.0, 1.7]), float(lasts_s)  # satellites are all above
 
 
-def _make_lasting_noise(count: int, step: float, rng: np.random.Generator) -> Float:
+def _make_lasting_noise(count: int, step: float, rng: np.random.Generator) -> Floats:
     """Return Gauss-Markov series of unit variance, shape (count, 3); ``step`` is between rows, in correlation times."""
     white = rng.standard_normal((3, count))
     return np.stack([make_correlated_noise(np.ascontiguousarray(row), float(np.exp(-step))) for row in white], axis=-1)
@@ -487,24 +488,24 @@ def _remove_stretch(
     return (stamp < begin) | (stamp >= begin + round(length_s * 1e9))
 
 
-def _dead_reckon(velocity: Float, yaw_rate: Float, dt_s: float) -> tuple[Float, Float, Float]:
+def _dead_reckon(velocity: Floats, yaw_rate: Floats, dt_s: float) -> tuple[Floats, Floats, Floats]:
     yaw = np.concatenate([[0.0], np.cumsum(yaw_rate[1:] + yaw_rate[:-1]) * dt_s / 2])
     step_x, step_y = velocity * np.cos(yaw) * dt_s, velocity * np.sin(yaw) * dt_s
     return np.cumsum(step_x) - step_x[0], np.cumsum(step_y) - step_y[0], (yaw + np.pi) % (2 * np.pi) - np.pi
 
 
-def _interpolate(values: Float, truth: Truth, stamp: NDArray[np.int64]) -> Float:
+def _interpolate(values: Floats, truth: Truth, stamp: NDArray[np.int64]) -> Floats:
     return np.stack([np.interp(stamp, truth.stamp_ns, column) for column in values.T], axis=-1)
 
 
-def _make_wandering_bias(stamp: NDArray[np.int64], size: float, rng: np.random.Generator) -> Float:
+def _make_wandering_bias(stamp: NDArray[np.int64], size: float, rng: np.random.Generator) -> Floats:
     """Return a constant of about ``size`` per axis that drifts by a fifth of it with a correlation time of 100 s, shape (N, 3)."""
     constant = size * np.sign(rng.standard_normal(3)) * rng.uniform(0.6, 1.2, 3)
     step_s = float(np.median(np.diff(stamp))) * 1e-9
     return constant + 0.2 * size * _make_lasting_noise(stamp.size, step_s / 100.0, rng)
 
 
-def _mean_before(truth: Truth, values: Float, stamp: NDArray[np.int64], period_ns: int) -> Float:
+def _mean_before(truth: Truth, values: Floats, stamp: NDArray[np.int64], period_ns: int) -> Floats:
     """Return the mean of a series over the period that ends at each stamp; of no period the value there."""
     if not period_ns:
         return np.interp(stamp, truth.stamp_ns, values)
@@ -515,7 +516,9 @@ def _mean_before(truth: Truth, values: Float, stamp: NDArray[np.int64], period_n
     return np.asarray(area / np.maximum((stamp - start) * 1e-9, 1e-12))
 
 
-def _make_camera_pose(at: Truth, sensor: Visual, faults: Faults, wrong_mps: Float, noise: Noise) -> tuple[Float, Float]:
+def _make_camera_pose(
+    at: Truth, sensor: Visual, faults: Faults, wrong_mps: Floats, noise: Noise
+) -> tuple[Floats, Floats]:
     """Return the camera's drifting pose: increments of the true pose, scaled, with the velocity errors integrated."""
     base_from_camera = sensor.mounting.quat_xyzw()
     enu_from_camera = multiply(at.quat_xyzw, base_from_camera)

@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.compiled import compile_kernel
 from tcpipe.geometry.rotation import normalize, rpy_from_quat
-from tcpipe.simulation.world import Float
 
 _COMPONENTS = {
     "enu_m": ("east_m", "north_m", "up_m"),
@@ -29,28 +29,28 @@ class Truth:
     """
 
     stamp_ns: NDArray[np.int64]
-    x_map_m: Float
-    y_map_m: Float
-    lon_deg: Float
-    lat_deg: Float
-    alt_m: Float  # above the ellipsoid
-    enu_m: Float
-    quat_xyzw: Float
-    velocity_enu_mps: Float
-    angular_velocity_radps: Float  # in base_link, shape (N, 3)
-    forward_velocity_mps: Float  # along base_link's x, on the surface
-    wheel_velocity_mps: Float
-    slip: Float
-    slope_rad: Float  # along base_link's x, positive uphill
+    x_map_m: Floats
+    y_map_m: Floats
+    lon_deg: Floats
+    lat_deg: Floats
+    alt_m: Floats  # above the ellipsoid
+    enu_m: Floats
+    quat_xyzw: Floats
+    velocity_enu_mps: Floats
+    angular_velocity_radps: Floats  # in base_link, shape (N, 3)
+    forward_velocity_mps: Floats  # along base_link's x, on the surface
+    wheel_velocity_mps: Floats
+    slip: Floats
+    slope_rad: Floats  # along base_link's x, positive uphill
     terrain_class: NDArray[np.uint8]
-    command_velocity_mps: Float
-    command_yaw_rate_radps: Float
-    voltage_volt: Float
-    current_amp: Float  # propulsion, both drivers, drawn positive
-    right_share: Float  # of the current, drawn by the right driver
-    power_watt: Float
-    energy_joule: Float  # since the start
-    distance_m: Float  # horizontal way since the start
+    command_velocity_mps: Floats
+    command_yaw_rate_radps: Floats
+    voltage_volt: Floats
+    current_amp: Floats  # propulsion, both drivers, drawn positive
+    right_share: Floats  # of the current, drawn by the right driver
+    power_watt: Floats
+    energy_joule: Floats  # since the start
+    distance_m: Floats  # horizontal way since the start
 
     def at(self, stamp_ns: NDArray[np.int64]) -> Truth:
         """Return the truth at other times, linear between steps; beyond the ends it is held."""
@@ -58,7 +58,7 @@ class Truth:
         low = np.minimum(position.astype(np.int64), self.stamp_ns.size - 2)
         part = position - low
 
-        def between(values: Float) -> Float:
+        def between(values: Floats) -> Floats:
             weight = part if values.ndim == 1 else part[:, None]
             return np.asarray(values[low] + weight * (values[low + 1] - values[low]))
 
@@ -100,12 +100,12 @@ class Truth:
 class TrueCost:
     """The cost of the true metre that begins at given times; NaN where the drive ends before a metre is driven."""
 
-    end_ns: Float
-    duration_s: Float
-    energy_joule: Float
-    power_watt: Float
-    velocity_mps: Float
-    arc_length_m: Float
+    end_ns: Floats
+    duration_s: Floats
+    energy_joule: Floats
+    power_watt: Floats
+    velocity_mps: Floats
+    arc_length_m: Floats
 
 
 def compute_true_cost(truth: Truth, start_ns: NDArray[np.int64], chord_m: float = 1.0) -> TrueCost:
@@ -123,7 +123,7 @@ def compute_true_cost(truth: Truth, start_ns: NDArray[np.int64], chord_m: float 
 
 
 @compile_kernel
-def _find_crossing(seconds: Float, xy_m: Float, start_s: Float, chord_m: float) -> Float:
+def _find_crossing(seconds: Floats, xy_m: Floats, start_s: Floats, chord_m: float) -> Floats:
     """Return when the distance from the place at each start first reaches the chord [s]; NaN if never."""
     end = np.full(start_s.size, np.nan)
     last = seconds.size - 1

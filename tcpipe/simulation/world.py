@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.special import erf
 
+from tcpipe.arrays import Floats
 from tcpipe.tables.facts import ABSENT
-
-Float = NDArray[np.float64]
 
 _SEMI_MAJOR_M = 6378137.0
 _ECCENTRICITY2 = 0.0066943799901413165
@@ -58,26 +57,26 @@ class Site:
         steps = f"+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 +lon_0={lon!r} +lat_0={lat!r} +h_0={alt!r}"
         return Transformer.from_pipeline(f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad {steps}")
 
-    def lonlat_deg(self, x_map_m: Float, y_map_m: Float) -> tuple[Float, Float]:
+    def lonlat_deg(self, x_map_m: Floats, y_map_m: Floats) -> tuple[Floats, Floats]:
         """Return longitude and latitude [deg] of map coordinates [m]."""
         lon, lat = self._to_wgs84.transform(x_map_m, y_map_m)
         return np.asarray(lon), np.asarray(lat)
 
-    def map_xy_m(self, lon_deg: Float, lat_deg: Float) -> tuple[Float, Float]:
+    def map_xy_m(self, lon_deg: Floats, lat_deg: Floats) -> tuple[Floats, Floats]:
         """Return map coordinates [m] of longitude and latitude [deg]."""
         x, y = self._to_wgs84.transform(lon_deg, lat_deg, direction="INVERSE")
         return np.asarray(x), np.asarray(y)
 
-    def enu_m(self, lon_deg: Float, lat_deg: Float, alt_m: Float) -> Float:
+    def enu_m(self, lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> Floats:
         """Return east, north, up of the datum [m], shape (N, 3)."""
         return np.stack(self._to_enu.transform(lon_deg, lat_deg, alt_m), axis=-1)
 
-    def lonlatalt(self, enu_m: Float) -> tuple[Float, Float, Float]:
+    def lonlatalt(self, enu_m: Floats) -> tuple[Floats, Floats, Floats]:
         """Return longitude, latitude [deg] and ellipsoidal height [m] of points of the local plane, shape (N, 3)."""
         lon, lat, alt = self._to_enu.transform(enu_m[..., 0], enu_m[..., 1], enu_m[..., 2], direction="INVERSE")
         return np.asarray(lon), np.asarray(lat), np.asarray(alt)
 
-    def ground_from_map(self, x_map_m: Float, y_map_m: Float, alt_m: Float) -> tuple[Float, Float]:
+    def ground_from_map(self, x_map_m: Floats, y_map_m: Floats, alt_m: Floats) -> tuple[Floats, Floats]:
         """Return ground metres per map metre, and the true direction of the map's x axis from east [rad].
 
         Ground metres are horizontal metres at the height ``alt_m`` above the ellipsoid.
@@ -119,7 +118,7 @@ def draw_waves(
     return tuple(Wave(amplitude, float(np.exp(log_m)), direction, phase) for log_m, direction, phase in drawn)
 
 
-def sum_waves(waves: Sequence[Wave], u: Float, v: Float) -> Float:
+def sum_waves(waves: Sequence[Wave], u: Floats, v: Floats) -> Floats:
     """Sum the waves; sin(a + b) is expanded, so that row and column vectors meet in outer products only."""
     total = np.zeros(np.broadcast_shapes(np.shape(u), np.shape(v)))
     for wave in waves:
@@ -130,7 +129,7 @@ def sum_waves(waves: Sequence[Wave], u: Float, v: Float) -> Float:
     return total
 
 
-def evaluate_field(waves: Sequence[Wave], u: Float, v: Float) -> Float:
+def evaluate_field(waves: Sequence[Wave], u: Floats, v: Floats) -> Floats:
     """Sum many waves: a row and a column meet in one product of matrices, anything else wave by wave."""
     if np.ndim(u) == np.ndim(v) == 2 and np.shape(u)[0] == np.shape(v)[1] == 1:
         amplitude, length, direction, phase = np.array([astuple(wave) for wave in waves]).T
@@ -146,7 +145,7 @@ def evaluate_field(waves: Sequence[Wave], u: Float, v: Float) -> Float:
     return total
 
 
-def state(waves: Sequence[Wave], u: Float, v: Float) -> Float:
+def state(waves: Sequence[Wave], u: Floats, v: Floats) -> Floats:
     """Return a field that is spread evenly over -1 … 1, of waves whose squares sum to 1."""
     return np.asarray(erf(evaluate_field(waves, u, v) / np.sqrt(2.0)))
 
@@ -178,28 +177,28 @@ class Surface:
     map_noise_std_m: float  # of the height raster, which costs nothing
     swing: float  # by how much grain, bumps and ridges grow where their state is 1, as a fraction
 
-    def shade(self, classes: NDArray[np.uint8], u: Float, v: Float) -> Float:
+    def shade(self, classes: NDArray[np.uint8], u: Floats, v: Floats) -> Floats:
         """Return what the brightness is multiplied with, at offsets from the site's corner [m]."""
         grain = 1.0 + self.swing * state(self.cover, u, v)
         grain *= self._by_class("grain")[classes] * evaluate_field(self.grain, u, v)
         return np.asarray((1.0 - self._by_class("wet_shade")[classes] * state(self.wetness, u, v)) * (1.0 + grain))
 
-    def resistance(self, classes: NDArray[np.uint8], u: Float, v: Float) -> Float:
+    def resistance(self, classes: NDArray[np.uint8], u: Floats, v: Floats) -> Floats:
         """Return the rolling resistance that is added, as a fraction of the class's."""
         wet = self._by_class("wet_resistance")[classes] * state(self.wetness, u, v)
         return np.asarray(wet + self._by_class("cover_resistance")[classes] * state(self.cover, u, v))
 
-    def relief_m(self, classes: NDArray[np.uint8], u: Float, v: Float) -> Float:
+    def relief_m(self, classes: NDArray[np.uint8], u: Floats, v: Floats) -> Floats:
         """Return the height of bumps and ridges [m]."""
         relief = self._by_class("bump_m")[classes] * evaluate_field(self.bumps, u, v)
         relief += self._by_class("ridge_m")[classes] * evaluate_field(self.ridges, u, v)
         return np.asarray(relief * (1.0 + self.swing * state(self.roughness, u, v)))
 
-    def map_noise_m(self, u: Float, v: Float) -> Float:
+    def map_noise_m(self, u: Floats, v: Floats) -> Floats:
         """Return what the height raster errs by [m]."""
         return self.map_noise_std_m * evaluate_field(self.noise, u, v)
 
-    def _by_class(self, name: str) -> Float:
+    def _by_class(self, name: str) -> Floats:
         """Return one number of every class's look, by class id."""
         table = np.zeros(256)
         table[list(self.looks)] = [getattr(look, name) for look in self.looks.values()]
@@ -227,7 +226,7 @@ class Hill:
     x_sigma_m: float
     y_sigma_m: float
 
-    def rise_m(self, u: Float, v: Float) -> Float:
+    def rise_m(self, u: Floats, v: Floats) -> Floats:
         """Return its height there [m]."""
         x, y = (u - self.x_m) / self.x_sigma_m, (v - self.y_m) / self.y_sigma_m
         return np.asarray(self.height_m * np.exp(-0.5 * x**2) * np.exp(-0.5 * y**2))
@@ -244,7 +243,7 @@ class Ellipse:
     y_radius_m: float
     rotation_rad: float = 0.0
 
-    def depth_m(self, u: Float, v: Float) -> Float:
+    def depth_m(self, u: Floats, v: Floats) -> Floats:
         """Return the depth inside, as the protocol says."""
         c, s = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
         a = (c * (u - self.x_m) + s * (v - self.y_m)) / self.x_radius_m
@@ -270,7 +269,7 @@ class Band:
     wavelength_m: float = 60.0
     phase_rad: float = 0.0
 
-    def depth_m(self, u: Float, v: Float) -> Float:
+    def depth_m(self, u: Floats, v: Floats) -> Floats:
         """Return the depth inside, as the protocol says."""
         c, s = np.cos(self.direction_rad), np.sin(self.direction_rad)
         along, across = c * (u - self.x_m) + s * (v - self.y_m), c * (v - self.y_m) - s * (u - self.x_m)
@@ -306,7 +305,7 @@ class World:
     sun: tuple[float, float, float] | None = field(default=None, metadata=ABSENT)
     """Unit vector east, north, up to the sun that the orthophoto was taken in; None: under an even sky."""
 
-    def height_m(self, x_map_m: Float, y_map_m: Float) -> Float:
+    def height_m(self, x_map_m: Floats, y_map_m: Floats) -> Floats:
         """Return the height above the geoid [m]."""
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         total = np.full(np.broadcast_shapes(np.shape(u), np.shape(v)), self.base_m)
@@ -314,7 +313,7 @@ class World:
             total += hill.rise_m(u, v)
         return total + sum_waves(self.waves, u, v)
 
-    def mapped_height_m(self, x_map_m: Float, y_map_m: Float) -> Float:
+    def mapped_height_m(self, x_map_m: Floats, y_map_m: Floats) -> Floats:
         """Return the height that a raster holds: with bumps and ridges, which wheels feel and the pose does not, and the map's noise."""
         height = self.height_m(x_map_m, y_map_m)
         if self.surface is None:
@@ -323,7 +322,7 @@ class World:
         classes = self.terrain_class(x_map_m, y_map_m)
         return height + self.surface.relief_m(classes, u, v) + self.surface.map_noise_m(u, v)
 
-    def gradient(self, x_map_m: Float, y_map_m: Float) -> tuple[Float, Float]:
+    def gradient(self, x_map_m: Floats, y_map_m: Floats) -> tuple[Floats, Floats]:
         """Return the rise per map metre along the map's x and y."""
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         gx, gy = np.zeros(np.broadcast_shapes(np.shape(u), np.shape(v))), np.zeros(())
@@ -338,7 +337,7 @@ class World:
             gx, gy = gx + kx * rise, gy + ky * rise
         return gx, gy
 
-    def terrain_class(self, x_map_m: Float, y_map_m: Float) -> NDArray[np.uint8]:
+    def terrain_class(self, x_map_m: Floats, y_map_m: Floats) -> NDArray[np.uint8]:
         """Return the class id, everywhere (the holes of the rasters do not matter here)."""
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         classes = np.full(np.broadcast_shapes(np.shape(u), np.shape(v)), GRASS, dtype=np.uint8)
@@ -346,7 +345,7 @@ class World:
             classes[region.depth_m(u, v) > 0.0] = region.class_id
         return classes
 
-    def ortho(self, x_map_m: Float, y_map_m: Float) -> Float:
+    def ortho(self, x_map_m: Floats, y_map_m: Floats) -> Floats:
         """Return red, green, blue in 0 … 255, last axis; classes blend over 0.3 m at their borders."""
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         rgb = np.broadcast_to(_COLOUR[GRASS], (*np.broadcast_shapes(np.shape(u), np.shape(v)), 3)).copy()
@@ -363,7 +362,7 @@ class World:
             shade = shade * np.maximum(1.0 - (east * gx + north * gy) / up, 0.0) / np.sqrt(1.0 + gx**2 + gy**2)
         return rgb * shade[..., None]
 
-    def mapped(self, x_map_m: Float, y_map_m: Float) -> NDArray[np.bool_]:
+    def mapped(self, x_map_m: Floats, y_map_m: Floats) -> NDArray[np.bool_]:
         """Return whether the rasters hold data here."""
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         inside = (u >= 0) & (u <= self.site.width_m) & (v >= 0) & (v <= self.site.height_m)
@@ -371,7 +370,7 @@ class World:
             inside = inside & (hole.depth_m(u, v) <= 0.0)
         return inside
 
-    def resistance_factor(self, x_map_m: Float, y_map_m: Float) -> Float:
+    def resistance_factor(self, x_map_m: Floats, y_map_m: Floats) -> Floats:
         """Return what the class's rolling resistance is multiplied with here: what the orthophoto shows, and what nothing does."""
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         hidden = sum_waves(self.resistance, u, v)
@@ -380,7 +379,7 @@ class World:
         return 1.0 + hidden + self.surface.resistance(self.terrain_class(x_map_m, y_map_m), u, v)
 
     @staticmethod
-    def _near(regions: Sequence[Ellipse | Band], u: Float, v: Float) -> Sequence[Ellipse | Band]:
+    def _near(regions: Sequence[Ellipse | Band], u: Floats, v: Floats) -> Sequence[Ellipse | Band]:
         if not (np.size(u) and np.size(v)):
             return ()
         box = (float(np.min(u)), float(np.min(v)), float(np.max(u)), float(np.max(v)))

@@ -16,12 +16,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Mask
 from tcpipe.splits.regions import Regions, classify_footprints
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.signedinteger]
 Names = NDArray[np.str_]
-Mask = NDArray[np.bool_]
 Ranks = NDArray[np.uint64]
 Holdout = Literal["block", "sample", "run", "tag"]
 

@@ -9,11 +9,10 @@ import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tcpipe.arrays import Floats, Mask
 from tcpipe.tables.facts import HeldOut
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.signedinteger]
-Mask = NDArray[np.bool_]
 
 _CONTACT_FRACTION = 1e-3
 """Footprints that share less of their area than this touch; consecutive segments always do."""

@@ -16,7 +16,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-Floats = NDArray[np.float64]
+from tcpipe.arrays import Floats
+
 Project = Callable[[Floats], Floats]
 Geometries = TypeVar("Geometries", BaseGeometry, NDArray[np.object_])
 

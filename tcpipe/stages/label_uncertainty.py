@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.labels import SensorError
 from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
 from tcpipe.motion.row_sections import find_runs, number_pieces
@@ -40,8 +41,6 @@ from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_number
 from tcpipe.tables.facts import LabelFacts, PhysicsFacts, PowerSensorFacts, PowerSign, StageFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo
-
-Floats = NDArray[np.float64]
 
 
 def find_stationary_ns(rows: pa.Table, rate_hz: float, *, but: int = 0) -> NDArray[np.int64]:

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tcpipe.arrays import Floats, Mask
 from tcpipe.errors import FusionError
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.motion import masks
 from tcpipe.motion.distance_breakdown import JUMP_M, compute_unexplained_m
-from tcpipe.motion.row_sections import Floats, Mask, MotionRows, dilate_mask, number_pieces
+from tcpipe.motion.row_sections import MotionRows, dilate_mask, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_chord_ahead_std_m, find_common_scale_std
 from tcpipe.recipe import MaskConfig, TimeWindow
 from tcpipe.recipe.suggestions import suggest

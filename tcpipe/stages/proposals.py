@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.logs.expressions import UNITS
 from tcpipe.logs.field_mapping import Columns, list_number_fields, match_field_names
 from tcpipe.logs.power_fields import match_power_fields, split_sides, split_words
@@ -25,8 +25,6 @@ from tcpipe.recipe.suggestions import Keys, format_first, suggest
 from tcpipe.robots import PowerSource, Profiles
 from tcpipe.stages.message_arrays import LogReader, make_message_arrays
 from tcpipe.tables.findings import Finding, Subject, make_finding
-
-Floats = NDArray[np.float64]
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _GRAVITY_MPS2 = UNITS["m/s2"]["g"]

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.aoi import AreaOfInterest
 from pyproj.crs import BoundCRS
@@ -20,10 +19,9 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import AreaOfInterest as TransformArea
 from pyproj.transformer import TransformerGroup
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import MapError
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
-
-FloatArray = NDArray[np.float64]
 
 MAX_SCALE_ERROR = 0.01
 """A CRS whose unit is further from a metre of ground than this share is not metric enough to cut patches in."""
@@ -79,7 +77,7 @@ def format_crs(crs: CRS) -> str:
     return ":".join(authority) if authority else crs.to_wkt()
 
 
-def make_metres_from_plane(crs: CRS, xy: FloatArray) -> FloatArray:
+def make_metres_from_plane(crs: CRS, xy: Floats) -> Floats:
     """Return the local map from the CRS plane to the ground, at points of the plane, shape (N, 2, 2).
 
     It is metres east and north on the ellipsoid per CRS unit in x and y; NaN where the CRS is not defined.
@@ -107,7 +105,7 @@ def _read_ellipsoid(crs: CRS) -> tuple[float, float]:
     return a, 1.0 - (b / a) ** 2
 
 
-def is_metric(crs: CRS, xy: FloatArray) -> bool:
+def is_metric(crs: CRS, xy: Floats) -> bool:
     """Return whether the CRS is right-handed and within one per cent of metres at all the given points of its plane."""
     if not crs.is_projected:
         return False
@@ -151,15 +149,15 @@ class Projection:
             raise MapError(f"no transformation is known from {self.source.name!r} to {self.target.name!r}")
         return group.transformers[0]
 
-    def forward(self, xy: FloatArray) -> FloatArray:
+    def forward(self, xy: Floats) -> Floats:
         """Return points of shape (..., 2) in the target CRS; infinite where the CRS is not defined."""
         return self._transform(xy, "FORWARD")
 
-    def inverse(self, xy: FloatArray) -> FloatArray:
+    def inverse(self, xy: Floats) -> Floats:
         """Return points of the target CRS, shape (..., 2), in the source CRS."""
         return self._transform(xy, "INVERSE")
 
-    def _transform(self, xy: FloatArray, direction: str) -> FloatArray:
+    def _transform(self, xy: Floats, direction: str) -> Floats:
         try:
             x, y = self._transformer.transform(xy[..., 0], xy[..., 1], direction=direction)
         except ProjError as error:

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
+from tcpipe.arrays import Floats
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.sampling_kernel import compute_morton
 from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_window
 
-FloatArray = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 REACH_M, KNOWN_M = 4.0, 0.25
@@ -36,7 +36,7 @@ _LATTICE_M = np.stack(np.meshgrid(_SHIFT_M, _SHIFT_M), axis=-1)
 _MIDDLE = len(_SHIFT_M) // 2, len(_SHIFT_M) // 2
 
 
-def _expand_square(east_m: FloatArray, north_m: FloatArray) -> FloatArray:
+def _expand_square(east_m: Floats, north_m: Floats) -> Floats:
     """Return the terms by which value, gradient and curvature of a paraboloid enter its value at places (N,), shape (N, 6)."""
     squares = east_m**2 / 2.0, east_m * north_m, north_m**2 / 2.0
     return np.stack([np.ones_like(east_m), east_m, north_m, *squares], axis=-1)
@@ -118,7 +118,7 @@ class Registration:
     significant: bool
     at_reach: bool
     scale: HeightScale
-    covariance: FloatArray
+    covariance: Floats
 
     @property
     def shift_m(self) -> float:
@@ -132,7 +132,7 @@ class Registration:
         return float(max(variances[variances < KNOWN_M**2] ** 0.5, default=np.nan))
 
     @property
-    def axis_std_m(self) -> FloatArray:
+    def axis_std_m(self) -> Floats:
         """Standard deviations of the shift along both axes [m], NaN unless it is determined in both directions."""
         return np.sqrt(np.diag(self.covariance)) if _count_known(self.covariance) > 1 else np.full(2, np.nan)
 
@@ -147,7 +147,7 @@ class Registration:
         return self.shifted_misfit_m if self.significant else self.misfit_m
 
 
-def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) -> Registration | None:
+def register_track(source: MapReader, xy_m: Floats, height_m: Floats) -> Registration | None:
     """Return the horizontal shift at which the map's ground fits the heights of a track best.
 
     None where fewer than 60 points, half a metre apart, lie well inside the map and on its ground.
@@ -174,7 +174,7 @@ def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) ->
     return _refine_shift(excess_m[near], excess_m[good], xy_m[good], scale)
 
 
-def _thin_track(xy_m: FloatArray, height_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _thin_track(xy_m: Floats, height_m: Floats) -> tuple[Floats, Floats]:
     """Return finite points half a metre of path apart, or further apart if there are too many."""
     is_finite = np.isfinite(xy_m).all(axis=1) & np.isfinite(height_m)
     xy_m, height_m = xy_m[is_finite], height_m[is_finite]
@@ -184,7 +184,7 @@ def _thin_track(xy_m: FloatArray, height_m: FloatArray) -> tuple[FloatArray, Flo
     return xy_m[rows], height_m[rows]
 
 
-def _sample_heights(level: MapReader, xy_m: FloatArray) -> FloatArray:
+def _sample_heights(level: MapReader, xy_m: Floats) -> Floats:
     """Return the map's heights at every point moved by every pair of shifts (north, east), shape (N, K, K); NaN without data."""
     px, offset_px = level.grid.px_from_xy(xy_m), _SHIFT_M / level.grid.pixel_size_m
     reach_px, found = int(np.ceil(offset_px[-1])) + 2, np.empty((len(xy_m), *2 * _SHIFT_M.shape))
@@ -198,7 +198,7 @@ def _sample_heights(level: MapReader, xy_m: FloatArray) -> FloatArray:
     return found + level.height_reference_m
 
 
-def _find_ground(excess_m: FloatArray, xy_m: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _find_ground(excess_m: Floats, xy_m: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the points on the map's ground at the shift that fits best, (N,), and those of them that determine a shift.
 
     These are not on cliffs, unless too few are left.
@@ -220,20 +220,20 @@ def _find_ground(excess_m: FloatArray, xy_m: FloatArray) -> tuple[NDArray[np.boo
     return near, good
 
 
-def _fit_tilt(xy_m: FloatArray, excess_m: FloatArray) -> FloatArray:
+def _fit_tilt(xy_m: Floats, excess_m: Floats) -> Floats:
     """Return the tilt of the plane that leaves the least absolute excess, shape (N,) [m]: a bridge or a tree does not turn it."""
     off_m, columns = excess_m - np.median(excess_m), np.column_stack([xy_m - xy_m.mean(axis=0), np.ones(len(xy_m))])
     plane = least_squares(lambda plane: columns @ plane - off_m, np.zeros(3), loss="soft_l1", f_scale=0.01).x
     return np.asarray(columns[:, :2] @ plane[:2])
 
 
-def _find_least(spread: FloatArray) -> tuple[int, int]:
+def _find_least(spread: Floats) -> tuple[int, int]:
     """Return the lattice indices (north, east) of the shift that leaves the least spread."""
     i, j = np.unravel_index(int(spread.argmin()), spread.shape)
     return int(i), int(j)
 
 
-def _flatten(excess_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatArray, Rows]:
+def _flatten(excess_m: Floats, xy_m: Floats) -> tuple[Floats, Floats, Rows]:
     """Return the excess without tilt and drift, constant in each stretch of path; the columns of a tilt, (N, 2); each point's block."""
     path_m = np.cumsum(np.hypot(*np.diff(xy_m, axis=0, prepend=xy_m[:1]).T))
     count = max(_BLOCKS, round(float(path_m[-1]) / _DRIFT_M))
@@ -246,13 +246,13 @@ def _flatten(excess_m: FloatArray, xy_m: FloatArray) -> tuple[FloatArray, FloatA
     return _remove_tilt(flat_m, tilt), tilt, (rank * min(_BLOCKS, len(sizes)) // len(sizes))[stretch]
 
 
-def _remove_tilt(values: FloatArray, tilt: FloatArray) -> FloatArray:
+def _remove_tilt(values: Floats, tilt: Floats) -> Floats:
     """Return values, shape (N, ...), less the least-squares multiples of a tilt's columns, (N, 2), whose means are zero."""
     flat = values.reshape(len(values), -1)
     return np.asarray((flat - tilt @ (np.linalg.pinv(tilt) @ flat)).reshape(values.shape))
 
 
-def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray, xy_m: FloatArray) -> HeightScale:
+def _fit_height_scale(ground_m: Floats, height_m: Floats, xy_m: Floats) -> HeightScale:
     """Return the scale of heights, fitted with a tilt of the map unless it is that of a known unit: no map is tilted so much."""
     whole, tilt = _regress_heights(ground_m, height_m), xy_m - xy_m.mean(axis=0)
     if whole.is_wrong() and whole.find_unit():
@@ -260,7 +260,7 @@ def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray, xy_m: FloatArr
     return _regress_heights(_remove_tilt(ground_m, tilt), _remove_tilt(height_m, tilt))
 
 
-def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
+def _regress_heights(ground_m: Floats, height_m: Floats) -> HeightScale:
     """Return the regression of the track's heights (N,) on the map's (N, K, K) at the shift where both are most alike."""
     ground, height = ground_m - ground_m.mean(axis=0), height_m - height_m.mean()
     squares, products = np.einsum("nij,nij->ij", ground, ground), np.einsum("nij,n->ij", ground, height)
@@ -273,7 +273,7 @@ def _regress_heights(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
     return HeightScale(float(products[best] / (squares[best] + _RIDGE)), std, float(explained[best]))
 
 
-def _refine_shift(near_m: FloatArray, good_m: FloatArray, xy_m: FloatArray, scale: HeightScale) -> Registration:
+def _refine_shift(near_m: Floats, good_m: Floats, xy_m: Floats, scale: HeightScale) -> Registration:
     """Return the best shift of the lattice, refined by the excess at good points; misfits are those of near points."""
     flat_m, tilt, block = _flatten(good_m, xy_m)
     squares = _resample_squares(flat_m, tilt, block)
@@ -306,7 +306,7 @@ def _refine_shift(near_m: FloatArray, good_m: FloatArray, xy_m: FloatArray, scal
     )
 
 
-def _resample_squares(flat_m: FloatArray, tilt: FloatArray, block: Rows) -> FloatArray:
+def _resample_squares(flat_m: Floats, tilt: Floats, block: Rows) -> Floats:
     """Return the squared misfits of all points, and of blocks drawn at random, shape (1 + draws, K, K), each without tilt."""
     flat, count = flat_m.reshape(len(flat_m), -1), int(block.max()) + 1
     drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), _DRAWS)
@@ -319,7 +319,7 @@ def _resample_squares(flat_m: FloatArray, tilt: FloatArray, block: Rows) -> Floa
     return np.asarray(squares.reshape(-1, *flat_m.shape[1:]))
 
 
-def _fit_paraboloids(misfits: FloatArray, at: Rows | None = None) -> tuple[Rows, FloatArray]:
+def _fit_paraboloids(misfits: Floats, at: Rows | None = None) -> tuple[Rows, Floats]:
     """Return the indices (north, east) of the least of each misfit, (R, 2), and the paraboloid around it, (R, 6), as `_expand_square`."""
     near = sliding_window_view(misfits, (2 * _NEAR + 1,) * 2, axis=(1, 2))
     if at is None:
@@ -329,12 +329,12 @@ def _fit_paraboloids(misfits: FloatArray, at: Rows | None = None) -> tuple[Rows,
     return at, windows.reshape(len(misfits), -1) @ _PARABOLOID.T
 
 
-def _estimate_covariance(without: FloatArray) -> FloatArray:
+def _estimate_covariance(without: Floats) -> Floats:
     """Return the covariance of an estimate by its values with each block left out, shape (B, K)."""
     spread = without - without.mean(axis=0)
     return np.asarray((len(without) - 1) / len(without) * spread.T @ spread)
 
 
-def _count_known(covariance: FloatArray) -> Rows:
+def _count_known(covariance: Floats) -> Rows:
     """Return how many directions a covariance, (..., 2, 2) [m²], determines."""
     return np.asarray((np.linalg.eigvalsh(covariance) < REACH_M**2 / 2.0).sum(axis=-1))

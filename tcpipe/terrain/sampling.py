@@ -20,14 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import TableError
 from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M, STACKS, group_stacks
 from tcpipe.terrain.sampling_kernel import Ground, Stacks, sample_tiles
 from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_tile, read_window
-
-FloatArray = NDArray[np.float64]
 
 
 def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
@@ -131,7 +130,7 @@ def sample_patches(
     return Patches(found, height_m, slope_rad, cross_slope_rad, valid, clipped, terrain_class, purity, profile_m)
 
 
-def _compute_profile(height: NDArray[np.uint16]) -> FloatArray:
+def _compute_profile(height: NDArray[np.uint16]) -> Floats:
     """Return ``profile_m`` of `Patches` by stored heights, shape (N, px, px)."""
     middle = slice((height.shape[1] - 1) // 2, height.shape[1] // 2 + 1)
     along_m = np.where((line := height[:, middle]) == HEIGHT_NODATA, np.nan, line * HEIGHT_STEP_M).mean(axis=1)
@@ -181,16 +180,16 @@ _PIXELS_DIFFER = "patch-pixels-unlike-map"
 class PatchFrames:
     """Places of N patches in the map's CRS: centre [m], and the vectors of one ground metre along and left of travel, (N, 2)."""
 
-    centre_xy_m: FloatArray
-    along_xy: FloatArray
-    left_xy: FloatArray
+    centre_xy_m: Floats
+    along_xy: Floats
+    left_xy: Floats
 
     def rows(self, chosen: NDArray[np.int64]) -> PatchFrames:
         """Return the chosen frames, in their order."""
         return PatchFrames(self.centre_xy_m[chosen], self.along_xy[chosen], self.left_xy[chosen])
 
 
-def make_patch_frames(start_xy_m: FloatArray, end_xy_m: FloatArray, chord_m: FloatArray) -> PatchFrames:
+def make_patch_frames(start_xy_m: Floats, end_xy_m: Floats, chord_m: Floats) -> PatchFrames:
     """Return the frames of patches from their segments' projected ends.
 
     Parameters
@@ -203,10 +202,10 @@ def make_patch_frames(start_xy_m: FloatArray, end_xy_m: FloatArray, chord_m: Flo
     return PatchFrames((start_xy_m + end_xy_m) / 2.0, along, left)
 
 
-def compute_footprints(frames: PatchFrames, patch_m: float) -> FloatArray:
+def compute_footprints(frames: PatchFrames, patch_m: float) -> Floats:
     """Return each patch's corners in the map's CRS [m], counter-clockwise from rear right, shape (N, 4, 2)."""
     signs = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]) * (patch_m / 2.0)
-    corners: FloatArray = (
+    corners: Floats = (
         frames.centre_xy_m[:, None, :]
         + signs[None, :, :1] * frames.along_xy[:, None, :]
         + signs[None, :, 1:] * frames.left_xy[:, None, :]
@@ -214,7 +213,7 @@ def compute_footprints(frames: PatchFrames, patch_m: float) -> FloatArray:
     return corners
 
 
-def count_corners_on(grid: MapGrid, footprint_xy_m: FloatArray) -> NDArray[np.int64]:
+def count_corners_on(grid: MapGrid, footprint_xy_m: Floats) -> NDArray[np.int64]:
     """Return how many corners of each footprint, shape (N, 4, 2), lie on the map, shape (N,)."""
     return np.asarray(np.count_nonzero(grid.contains(footprint_xy_m), axis=1))
 
@@ -230,7 +229,7 @@ def check_scale(frames: PatchFrames) -> None:
         )
 
 
-def map_px_from_patch(frames: PatchFrames, grid: MapGrid, *, patch_m: float, patch_px: int) -> FloatArray:
+def map_px_from_patch(frames: PatchFrames, grid: MapGrid, *, patch_m: float, patch_px: int) -> Floats:
     """Return where patches begin on the map, and their steps, shape (N, 6) [map px].
 
     These are x and y of patch pixel (0, 0); dx, dy for one column forward; dx, dy for one row to the right.
@@ -242,7 +241,7 @@ def map_px_from_patch(frames: PatchFrames, grid: MapGrid, *, patch_m: float, pat
     return np.hstack([grid.px_from_xy(first), frames.along_xy * down, -frames.left_xy * down])
 
 
-def sample_chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: FloatArray, points: int) -> FloatArray:
+def sample_chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: Floats, points: int) -> Floats:
     """Return evenly spread points on each chord: x and y of the first, dx and dy to the next, shape (N, 4) [map px].
 
     Point k lies at (k + ½) / points of the chord.

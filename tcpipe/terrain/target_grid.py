@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import MapError
 from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, is_metric
-
-FloatArray = NDArray[np.float64]
 
 LATTICE_STEP_PX = 16
 """Positions are projected at every so-many-th pixel and interpolated between: 1e-7 px off for a site, 1e-3 px for a country."""
@@ -49,27 +48,27 @@ class Georeference:
     cols: int
     name: str
 
-    def xy_from_px(self, px: FloatArray) -> FloatArray:
+    def xy_from_px(self, px: Floats) -> Floats:
         """Return points in the raster's CRS of pixel *corner* coordinates (col, row), shape (..., 2)."""
         a, b, c, d, e, f = self.affine
         col, row = px[..., 0], px[..., 1]
         return np.stack([a * col + b * row + c, d * col + e * row + f], axis=-1)
 
-    def px_from_xy(self, xy: FloatArray) -> FloatArray:
+    def px_from_xy(self, xy: Floats) -> Floats:
         """Return pixel *centre* coordinates (col, row; centres are integers) of points in the raster's CRS, shape (..., 2)."""
         a, b, c, d, e, f = self.affine
         x, y = xy[..., 0] - c, xy[..., 1] - f
         determinant = a * e - b * d
         return np.stack([(e * x - b * y) / determinant, (a * y - d * x) / determinant], axis=-1) - 0.5
 
-    def outline(self) -> FloatArray:
+    def outline(self) -> Floats:
         """Return points along the raster's outer edges in its CRS, shape (N, 2)."""
         t = np.linspace(0.0, 1.0, _EDGE_POINTS)
         zero, one = np.zeros_like(t), np.ones_like(t)
         edges = [np.stack(pair, axis=1) for pair in ((t, zero), (one, t), (1 - t, one), (zero, 1 - t))]
         return self.xy_from_px(np.concatenate(edges) * (self.cols, self.rows))
 
-    def centre(self) -> FloatArray:
+    def centre(self) -> Floats:
         """Return the middle of the raster in its CRS, shape (2,)."""
         return self.xy_from_px(np.array([self.cols / 2.0, self.rows / 2.0]))
 
@@ -89,7 +88,7 @@ def find_projection(raster: Georeference, crs: CRS) -> Projection | None:
     return Projection(raster.crs, crs, compute_area(raster.crs, bounds))
 
 
-def _project(raster: Georeference, points: FloatArray, crs: CRS) -> FloatArray:
+def _project(raster: Georeference, points: Floats, crs: CRS) -> Floats:
     """Return points of a raster's CRS in another."""
     projection = find_projection(raster, crs)
     return points if projection is None else projection.forward(points)
@@ -179,7 +178,7 @@ def _compute_pixel_side(raster: Georeference, crs: CRS) -> float:
 
 def compute_source_lattice(  # noqa: PLR0917
     grid: MapGrid, raster: Georeference, projection: Projection | None, row0: int, rows: int, col0: int, cols: int
-) -> FloatArray:
+) -> Floats:
     """Return the raster's pixel coordinates at every `LATTICE_STEP_PX`-th pixel of a block of the grid, shape (A, B, 2).
 
     They begin one step above and left of the block, end at least one step beyond, and are not finite where the raster's CRS is undefined.

@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import DTypeLike, NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import MAX_COLUMNS, MAX_TOPICS
 from tcpipe.formats.logs.log_part import gather_integers
@@ -27,7 +28,6 @@ from tcpipe.logs.autopilot import (
     CONVERTED,
     LATEST_US,
     Autopilot,
-    Int64,
     LeverArms,
     RoleMessages,
     find_lever_arms,
@@ -59,8 +59,8 @@ class AutopilotMessages:
 
     name: str
     layout: Layout
-    offsets: Int64
-    time_us: Int64
+    offsets: Ints
+    time_us: Ints
     scales: Mapping[str, float]
 
     def read_columns(self, data: bytes) -> dict[str, NDArray[Any]]:
@@ -74,7 +74,7 @@ class AutopilotMessages:
         }
 
 
-def _gather_field(data: bytes, offsets: Int64, layout: Layout, name: str) -> Int64:
+def _gather_field(data: bytes, offsets: Ints, layout: Layout, name: str) -> Ints:
     """Return a whole number of each message."""
     offset: int = layout.fields[name][1]  # type: ignore[index]  # a layout that has the field has fields
     return gather_integers(data, offsets + offset, layout[name].str[1:].replace("u8", "i8"))
@@ -117,7 +117,7 @@ class AutopilotRecords:
         )
         return end
 
-    def add(self, name: str, instance: int, layout: Layout, offsets: Int64, scales: Mapping[str, float]) -> None:
+    def add(self, name: str, instance: int, layout: Layout, offsets: Ints, scales: Mapping[str, float]) -> None:
         """Add the messages of an instance; without a time they cannot be used."""
         clock = next(
             (field for field in _CLOCKS if field in (layout.names or ()) and layout[field].str in ("<u8", "<u4")), None
@@ -153,7 +153,7 @@ class AutopilotRecords:
                 del self.messages[name]
 
 
-def _find_stray(time_us: Int64) -> NDArray[np.bool_]:
+def _find_stray(time_us: Ints) -> NDArray[np.bool_]:
     """Return which times, in the order of the file, are far from the median of those around them."""
     steps = np.diff(time_us)
     if len(time_us) < _WINDOW or not (steps < 0).any():
@@ -424,7 +424,7 @@ def _define_format(
 
 
 def _add_instances(
-    records: AutopilotRecords, name: str, layout: Layout, offsets: Int64, scales: Mapping[str, float]
+    records: AutopilotRecords, name: str, layout: Layout, offsets: Ints, scales: Mapping[str, float]
 ) -> None:
     """Add messages, those of each instance of a sensor apart."""
     instance = next(
@@ -480,7 +480,7 @@ def _find_base(name: str) -> str:
     return re.sub(r"_\d+$", "", name)
 
 
-def _make_stamped(messages: RoleMessages, stamp_ns: Int64, lever_arms: LeverArms) -> Fields:
+def _make_stamped(messages: RoleMessages, stamp_ns: Ints, lever_arms: LeverArms) -> Fields:
     """Return a message's fields with stamp and frame; what its values are given in is base_link where nothing places an IMU."""
     frame = "base_link" if messages.frame == "imu" and messages.frame not in lever_arms else messages.frame
     column = "child_frame_id" if messages.type_name == ODOMETRY else "header.frame_id"

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.formats.logs.chunk_reading import ChunkedPart, Excerpt, Messages
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     DamageError,
-    Int64Array,
     decompress,
     decompress_prefix,
     gather_integers,
@@ -325,7 +325,7 @@ class BagPart(ChunkedPart[_Chunk]):
             self._note("chunk-index-damaged", chunk.offset, messages_lost=lost or None)
         return walked
 
-    def read_indexes(self, chunks: list[_Chunk]) -> tuple[tuple[Int64Array, ...], Sequence[int]]:
+    def read_indexes(self, chunks: list[_Chunk]) -> tuple[tuple[Ints, ...], Sequence[int]]:
         """Return the messages of several chunks by the index records behind them."""
         held: list[bytes] = []
         places: list[tuple[int, int, int]] = []

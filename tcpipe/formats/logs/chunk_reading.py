@@ -15,8 +15,9 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_part import Bounds, ByteSource, DamageError, FetchedFile, Int64Array, MessageBlock
+from tcpipe.formats.logs.log_part import Bounds, ByteSource, DamageError, FetchedFile, MessageBlock
 from tcpipe.logs.topics import Damage, Topic
 
 GROUP_BYTES = 1 << 23
@@ -38,13 +39,13 @@ class Entries:
     They rise by chunk and offset. ``end`` is where in the chunk the next message begins, or the chunk ends.
     """
 
-    chunk: Int64Array
-    channel: Int64Array
-    offset: Int64Array
-    end: Int64Array
-    log_time_ns: Int64Array
+    chunk: Ints
+    channel: Ints
+    offset: Ints
+    end: Ints
+    log_time_ns: Ints
 
-    def at(self, chosen: slice | Int64Array | NDArray[np.bool_]) -> Entries:
+    def at(self, chosen: slice | Ints | NDArray[np.bool_]) -> Entries:
         """Return some of them."""
         columns = (self.chunk, self.channel, self.offset, self.end, self.log_time_ns)
         return Entries(*(values[chosen] for values in columns))
@@ -67,7 +68,7 @@ class Excerpt:
     """Bytes in which a span's messages lie: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,)."""
 
     data: memoryview
-    offset: Int64Array
+    offset: Ints
     entries: Entries
 
     def at(self, chosen: NDArray[np.bool_]) -> Excerpt:
@@ -80,19 +81,19 @@ class Messages:
     """Messages in ``data``: where the record of each and its payload begin, how long that is, and its times, shape (N,) each."""
 
     data: memoryview
-    channel: Int64Array
-    offset: Int64Array
-    payload: Int64Array
-    length: Int64Array
-    log_time_ns: Int64Array
-    publish_time_ns: Int64Array
+    channel: Ints
+    offset: Ints
+    payload: Ints
+    length: Ints
+    log_time_ns: Ints
+    publish_time_ns: Ints
 
-    def at(self, chosen: Int64Array | NDArray[np.bool_]) -> Messages:
+    def at(self, chosen: Ints | NDArray[np.bool_]) -> Messages:
         """Return some of them."""
         columns = (self.channel, self.offset, self.payload, self.length, self.log_time_ns, self.publish_time_ns)
         return Messages(self.data, *(values[chosen] for values in columns))
 
-    def blocks(self, ordinal: Int64Array) -> list[MessageBlock]:
+    def blocks(self, ordinal: Ints) -> list[MessageBlock]:
         """Return them as one block a channel; ``ordinal`` is their order within the file, shape (N,)."""
         if (self.channel[1:] < self.channel[:-1]).any():
             order = np.argsort(self.channel, kind="stable")
@@ -170,7 +171,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it, at most."""
 
     @abstractmethod
-    def read_indexes(self, chunks: list[AnyChunk]) -> tuple[tuple[Int64Array, ...], Sequence[int]]:
+    def read_indexes(self, chunks: list[AnyChunk]) -> tuple[tuple[Ints, ...], Sequence[int]]:
         """Return the messages of chunks by their indexes, and which chunks have no sound one.
 
         Of each message that is its chunk's number in the list, its channel, offset in the chunk and log time, shape (N,) each.
@@ -214,7 +215,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
             for span in plan_chunk_spans(entries, sizes, sound, sorted(wanted)):
                 yield from self._read_span_blocks(span, members, wanted)
 
-    def entries(self, chunks: list[AnyChunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
+    def entries(self, chunks: list[AnyChunk], sizes: Ints) -> tuple[Entries, NDArray[np.bool_]]:
         """Return the messages of chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
         (chunk, channel, offset, log_time_ns), unsound = self.read_indexes(chunks)
         entries, sound = sort_by_place(chunk, channel, offset, log_time_ns, sizes, least_bytes=self.least_bytes)
@@ -273,7 +274,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         for a, b, at in pieces:
             to[at : at + b - a] = data[a:b]
 
-    def _split_in_time(self, messages: Messages, ordinal: Int64Array) -> list[MessageBlock]:
+    def _split_in_time(self, messages: Messages, ordinal: Ints) -> list[MessageBlock]:
         """Return messages as blocks, without those whose time is past what 63 bits hold."""
         times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
         if not times.all():
@@ -309,11 +310,11 @@ def group_chunks(sizes: Iterable[int]) -> Iterator[range]:
 
 
 def sort_by_place(
-    chunk: Int64Array,
-    channel: Int64Array,
-    offset: Int64Array,
-    log_time_ns: Int64Array,
-    sizes: Int64Array,
+    chunk: Ints,
+    channel: Ints,
+    offset: Ints,
+    log_time_ns: Ints,
+    sizes: Ints,
     *,
     least_bytes: int,
 ) -> tuple[Entries, NDArray[np.bool_]]:
@@ -334,9 +335,7 @@ def sort_by_place(
     return (entries if sound.all() else entries.at(sound[chunk])), sound
 
 
-def plan_chunk_spans(
-    entries: Entries, sizes: Int64Array, sound: NDArray[np.bool_], wanted: Sequence[int]
-) -> Iterator[Span]:
+def plan_chunk_spans(entries: Entries, sizes: Ints, sound: NDArray[np.bool_], wanted: Sequence[int]) -> Iterator[Span]:
     """Yield, in order, how to read the chunks of a group: those of which little is wanted together, others one by one.
 
     ``entries`` are the messages of those whose index is sound; ``sizes`` [byte] and ``sound`` are of all chunks, shape (M,).
@@ -355,7 +354,7 @@ def plan_chunk_spans(
         first = after
 
 
-def lay_out_pieces(entries: Entries) -> tuple[dict[int, list[Piece]], Int64Array, int]:
+def lay_out_pieces(entries: Entries) -> tuple[dict[int, list[Piece]], Ints, int]:
     """Return how the pieces of chunks that hold messages are laid one after the other.
 
     That is the pieces of each chunk by its number; where each message then begins, in the order of the entries; and the bytes in all.

@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.errors import LogError
 from tcpipe.formats.object_storage import StoredObject
 from tcpipe.logs.topics import Damage, Topic
@@ -49,8 +50,6 @@ _HELD_BLOCKS = (1 << 26) // _BLOCK_BYTES
 _GAP_BLOCKS = 4
 """Blocks no further apart are fetched as one piece: a request costs as much as some."""
 
-Int64Array = NDArray[np.int64]
-
 
 class DamageError(Exception):
     """A piece of a file cannot be used; arguments are as of `Damage`, the cause "" where nothing is damaged."""
@@ -66,14 +65,14 @@ class MessageBlock:
 
     channel: int
     buffer: memoryview
-    offsets: Int64Array
-    lengths: Int64Array
-    log_time_ns: Int64Array
-    publish_time_ns: Int64Array
-    ordinal: Int64Array
+    offsets: Ints
+    lengths: Ints
+    log_time_ns: Ints
+    publish_time_ns: Ints
+    ordinal: Ints
 
 
-def group_by_key(keys: Int64Array) -> Iterator[tuple[int, Int64Array]]:
+def group_by_key(keys: Ints) -> Iterator[tuple[int, Ints]]:
     """Yield each key, rising, and where it stands, shape (M,) each: at the cost of one sort, however many keys there are."""
     order = np.argsort(keys, kind="stable")
     starts = np.flatnonzero(np.diff(keys[order], prepend=keys[order[:1]] - 1))
@@ -371,7 +370,7 @@ def decompress_prefix(codec: str, data: memoryview, size: int) -> memoryview:
     return memoryview(found)[:size]
 
 
-def gather_integers(buffer: bytes | memoryview, offsets: Int64Array, code: str) -> Int64Array:
+def gather_integers(buffer: bytes | memoryview, offsets: Ints, code: str) -> Ints:
     """Return the little-endian integers (numpy's ``code``: ``u2``, ``u4``, ``i8``) that lie at ``offsets``, of any alignment.
 
     The caller has checked the bounds. Unsigned 64-bit values are read as ``i8``: no length or time in a log reaches the sign bit, and

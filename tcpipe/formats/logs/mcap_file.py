@@ -15,6 +15,7 @@ import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.formats.logs.chunk_reading import (
     MAX_PLANNED_BYTES,
     ChunkedPart,
@@ -24,7 +25,6 @@ from tcpipe.formats.logs.chunk_reading import (
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     DamageError,
-    Int64Array,
     MessageBlock,
     decompress,
     decompress_prefix,
@@ -134,7 +134,7 @@ class McapPart(ChunkedPart[Chunk]):
         same = (messages.channel == entries.channel) & (messages.log_time_ns == entries.log_time_ns)
         return messages, right & same & (messages.length <= room)
 
-    def _step_through(self, chunk: Chunk, data: memoryview) -> tuple[Int64Array, int]:
+    def _step_through(self, chunk: Chunk, data: memoryview) -> tuple[Ints, int]:
         """Return where the records of a chunk begin, and where they end."""
         records, end = record_offsets(data, self._bounds.most_records)
         self._bounds.walk(chunk.offset, len(records))
@@ -216,7 +216,7 @@ class McapPart(ChunkedPart[Chunk]):
             raise DamageError("chunk-damaged")
         return data
 
-    def read_indexes(self, chunks: list[Chunk]) -> tuple[tuple[Int64Array, ...], Sequence[int]]:
+    def read_indexes(self, chunks: list[Chunk]) -> tuple[tuple[Ints, ...], Sequence[int]]:
         """Return the messages of several chunks by their indexes."""
         regions: list[memoryview | bytes] = []
         places: list[tuple[int, int, int, int]] = []
@@ -252,7 +252,7 @@ class McapPart(ChunkedPart[Chunk]):
         starts = itertools.accumulate((len(record) for record in records), initial=0)
         return b"".join(records), list(zip(index, starts, strict=False))
 
-    def _index_entries(self, offset: int, channel: int) -> Int64Array:
+    def _index_entries(self, offset: int, channel: int) -> Ints:
         """Return a message index as (log time, offset), shape (N, 2)."""
         return index_entries(self._index_record(offset), channel)
 
@@ -424,7 +424,7 @@ class McapPart(ChunkedPart[Chunk]):
         if chunk.index is None:
             self._tally_messages(data, find_message_offsets(data, records))
 
-    def _declare(self, chunk: Chunk, data: memoryview, records: Int64Array) -> None:
+    def _declare(self, chunk: Chunk, data: memoryview, records: Ints) -> None:
         for offset in records.tolist():
             if data[offset] in (OP_SCHEMA, OP_CHANNEL):
                 length = int.from_bytes(data[offset + 1 : offset + RECORD_HEAD], "little")
@@ -475,7 +475,7 @@ class McapPart(ChunkedPart[Chunk]):
         known, first_ns, last_ns = self._tallies.get(channel, (0, start_ns, end_ns))
         self._tallies[channel] = known + count, min(start_ns, first_ns), max(end_ns, last_ns)
 
-    def _tally_messages(self, data: memoryview, messages: Int64Array) -> None:
+    def _tally_messages(self, data: memoryview, messages: Ints) -> None:
         channels = gather_integers(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.int64)
         for channel, rows in group_by_key(channels):
             stamps = gather_integers(data, messages[rows] + RECORD_HEAD + 6, "i8")

@@ -11,8 +11,9 @@ import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.formats.logs.chunk_reading import Messages
-from tcpipe.formats.logs.log_part import ByteSource, DamageError, Int64Array, gather_integers, outline_of
+from tcpipe.formats.logs.log_part import ByteSource, DamageError, gather_integers, outline_of
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_CRC = 33
@@ -191,7 +192,7 @@ def parse_statistics(content: bytes | memoryview) -> Statistics:
     return Statistics(messages, chunks, fields.pairs(map_bytes))
 
 
-def index_entries(record: bytes | memoryview, channel: int) -> Int64Array:
+def index_entries(record: bytes | memoryview, channel: int) -> Ints:
     """Return a channel's message index as (log time, offset), shape (N, 2)."""
     if len(record) < _INDEX_HEAD.size:
         raise DamageError("chunk-index-damaged")
@@ -202,8 +203,8 @@ def index_entries(record: bytes | memoryview, channel: int) -> Int64Array:
 
 
 def index_messages(
-    data: bytes, records: Int64Array, ends: Int64Array, channels: Int64Array
-) -> tuple[NDArray[np.bool_], Int64Array, Int64Array, Int64Array]:
+    data: bytes, records: Ints, ends: Ints, channels: Ints
+) -> tuple[NDArray[np.bool_], Ints, Ints, Ints]:
     """Read several message indexes at once.
 
     ``records``, ``ends`` and ``channels`` say of each index, shape (R,), where it begins in ``data``, before which byte it must end, and
@@ -233,7 +234,7 @@ def index_messages(
     return right, record, gather_integers(data, places, "i8"), gather_integers(data, places + 8, "i8")
 
 
-def read_messages_at(data: memoryview, offsets: Int64Array) -> tuple[Messages, NDArray[np.bool_]]:
+def read_messages_at(data: memoryview, offsets: Ints) -> tuple[Messages, NDArray[np.bool_]]:
     """Return the messages whose records begin at ``offsets``, within the data, and which of them are messages by opcode and length."""
     count = max(len(data) - _MESSAGE.itemsize + 1, 0)
     windows: NDArray[np.void] = np.ndarray((count,), f"V{_MESSAGE.itemsize}", data if count else b"", 0, (1,))
@@ -250,7 +251,7 @@ def read_messages_at(data: memoryview, offsets: Int64Array) -> tuple[Messages, N
     return messages, (heads["opcode"] == OP_MESSAGE) & (heads["length"] >= MESSAGE_HEAD)
 
 
-def record_offsets(data: bytes | memoryview, most: int) -> tuple[Int64Array, int]:
+def record_offsets(data: bytes | memoryview, most: int) -> tuple[Ints, int]:
     """Walk the records in ``data`` and return where each begins, and where they end: one that does not fit, or is one too many, ends it."""
     size, position, found = len(data), 0, array("q")
     length_at = struct.Struct("<Q").unpack_from
@@ -263,11 +264,11 @@ def record_offsets(data: bytes | memoryview, most: int) -> tuple[Int64Array, int
     return np.array(found, np.int64), position
 
 
-def find_message_offsets(data: memoryview, records: Int64Array) -> Int64Array:
+def find_message_offsets(data: memoryview, records: Ints) -> Ints:
     """Return those of the records that are whole messages."""
     if not len(records):
         return records
-    messages: Int64Array = records[np.frombuffer(data, np.uint8)[records] == OP_MESSAGE]
+    messages: Ints = records[np.frombuffer(data, np.uint8)[records] == OP_MESSAGE]
     return messages[gather_integers(data, messages + 1, "i8") >= MESSAGE_HEAD] if len(messages) else messages
 
 

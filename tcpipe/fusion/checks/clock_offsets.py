@@ -20,6 +20,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.fusion.checks.motions import (
     FIXES_S,
     GRID_S,
@@ -71,8 +72,6 @@ _LIVELY, _NEAR_ROWS = 0.1, round(2.0 / GRID_S)
 """Yaw rate [rad/s] or change of speed [m/s] of a manoeuvre, and rows around one that are compared: 2 s."""
 
 YAW_RATE, SPEED, ACCELERATION = "yaw rate", "speed", "acceleration"
-
-Floats = NDArray[np.float64]
 
 
 def find_clock_offsets(m: Measurements, *, clock_epoch: int = 0) -> ClockFacts:

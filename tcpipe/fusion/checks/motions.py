@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS, DeadReckoning
 from tcpipe.fusion.level_motion import compute_levelling_rotations
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
@@ -43,9 +44,6 @@ FIXES_S = 0.5
 _LONGEST_NS, _STEP_NS = 1800 * 10**9, 300 * 10**9  # the window that is judged, and from one candidate to the next
 SMOOTH_S, _ACCELERATION_S, _SLOW_S = 0.1, 0.3, 4.0
 """Times over which speeds and yaw rates are averaged, and accelerations; slower changes are also slip and slopes [s]."""
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 def make_grid_ns(first_ns: int, last_ns: int) -> Ints:

@@ -16,6 +16,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.fusion.checks.motions import (
     GRID_S,
     SMOOTH_S,
@@ -50,7 +51,6 @@ from tcpipe.fusion.signals import Plane, hold_last
 from tcpipe.fusion.state import GRAVITY_MPS2
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 
-Floats = NDArray[np.float64]
 COMMAND = "command"
 """The command among the sensors; it is never excluded."""
 FORWARD, YAW = np.diag([-1.0, -1.0, 1.0]), np.diag([1.0, -1.0, -1.0])

@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Mask
 from tcpipe.errors import DatasetError, MapError, StoreError, list_first
 from tcpipe.formats.dataset_card import (
     DatasetCard,
@@ -260,8 +261,6 @@ _METRES_PER_DEG = 111_320.0
 _NEVER_NS = 2**61  # later than any time [ns since 1970]; twice of it still fits an int64
 
 _WAYS = 64  # most runs whose positions are in memory
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import LOCAL, DatasetCard, DatasetInputs, RunSource, SplitResult, judge_dataset
 from tcpipe.formats.parquet import ROWS_PER_GROUP
@@ -52,8 +52,6 @@ _KEPT_SECTIONS = ("fuse", "mask", "segment", "label", "sample", "split", "datase
 
 _KEPT_SUBJECTS = ("role", "class", "layer", "slope", "split")
 """Kinds of subjects whose names the dataset has anyway."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
