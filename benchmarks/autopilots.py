@@ -17,7 +17,7 @@ from autopilot_files import Drive, write_dataflash, write_ulog
 from pymavlink.DFReader import DFReader_binary
 from pyulog import ULog
 
-from tcpipe.formats.logs.autopilot_log import read_records
+from tcpipe.formats.logs.autopilot_log import read_autopilot_records
 from tcpipe.formats.logs.log_file import find_autopilot
 
 MOST_SHARE = {"ulog": 0.8, "dataflash": 0.1}
@@ -26,7 +26,7 @@ REPEATS = 3
 
 
 def with_tcpipe(path: Path, kind: str) -> int:
-    records = read_records(path, kind)
+    records = read_autopilot_records(path, kind)
     return sum(len(next(iter(of.read_columns(records.data).values()))) for of in records.messages.values())
 
 

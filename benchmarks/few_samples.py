@@ -25,7 +25,7 @@ from tcpipe.errors import TcpipeError
 from tcpipe.learning.fitting import FitConfig, ModelKind
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, compute_costs
 from tcpipe.learning.predictor import AUTOMATIC, Job, Samples, find_kind, predict_samples
-from tcpipe.learning.training import choose_kind, make_samples, select_train
+from tcpipe.learning.training import choose_kind, make_training_samples, select_train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 
@@ -36,7 +36,7 @@ def make_subset(data: Dataset, name: ModelKind | Literal["auto"], count: int, se
     train = select_train(data, config)
     train = train.take(np.sort(np.random.default_rng(seed).permutation(len(train))[:count]))
     chosen = choose_kind(data, config, train) if name == "auto" else name
-    return chosen, make_samples(data, config, find_kind(chosen), train)
+    return chosen, make_training_samples(data, config, find_kind(chosen), train)
 
 
 def measure(data: Dataset, name: str, count: int, seed: int) -> dict[str, tuple[float, float]]:

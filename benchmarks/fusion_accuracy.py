@@ -39,7 +39,7 @@ from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import Faults, Truth, read_truth, simulate
 from tcpipe.simulation.route import Wander
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_small_world
-from tcpipe.simulation.sensors import Gnss, Imu, Sensors, Visual, Wheels
+from tcpipe.simulation.sensors import Gnss, Imu, Sensors, Visual, WheelOdometry
 from tcpipe.stages.fuse_inputs import drop_implausible_sensors, prepare_sections
 from tcpipe.stages.read import read_run
 from tcpipe.tables.levels import Streams
@@ -56,7 +56,9 @@ def sensors(gnss_std_m: float, outage_s: float, vibration_mps2: float | None) ->
     given["gnss"] |= {"std_m": gnss_std_m, "vertical_std_m": vertical, "outage_s": outage_s}
     if vibration_mps2 is not None:
         given["imu"]["vibration_mps2"] = vibration_mps2
-    return Sensors(Gnss(**given["gnss"]), Wheels(**given["wheels"]), Imu(**given["imu"]), Visual(**given["visual"]))
+    return Sensors(
+        Gnss(**given["gnss"]), WheelOdometry(**given["wheels"]), Imu(**given["imu"]), Visual(**given["visual"])
+    )
 
 
 def possible_mps(gnss_std_m: float, vibration_mps2: float | None) -> float:

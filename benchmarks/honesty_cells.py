@@ -20,7 +20,7 @@ from tcpipe.formats.logs.writing import MessageStream
 from tcpipe.geometry.rotation import rotate
 from tcpipe.simulation.messages import TOPICS
 from tcpipe.simulation.robot import make_correlated_noise
-from tcpipe.simulation.sensors import Command, Gnss, Imu, Mounting, Power, Reading, Sensors, Visual, Wheels
+from tcpipe.simulation.sensors import Gnss, Imu, Joystick, Mounting, Power, Reading, Sensors, Visual, WheelOdometry
 from tcpipe.simulation.truth import Truth
 
 FixError: TypeAlias = Callable[[Truth, np.random.Generator], np.ndarray]
@@ -380,11 +380,11 @@ class HonestCell:
             gnss=Gnss(
                 rng.choice([5.0, 10.0]), _WHITE_M, UP * _WHITE_M, (0.0, 0.0), mounting=Mounting(arm_m), stated_off_m=0.0
             ),
-            wheels=Wheels(40.0, scale=rng.normal(1.0, 0.015), yaw_scale=rng.uniform(1.02, 1.15)),
+            wheels=WheelOdometry(40.0, scale=rng.normal(1.0, 0.015), yaw_scale=rng.uniform(1.02, 1.15)),
             imu=Imu(mounting=imu, orientation=bool(rng.integers(2))),
             visual=Visual(20.0, scale=rng.normal(1.0, 0.02), mounting=camera),
             power=Power(),
-            command=Command(),
+            command=Joystick(),
         )
         return replace(sensors, **dict.fromkeys(SETS[self.sensors]))
 

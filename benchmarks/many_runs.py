@@ -30,7 +30,7 @@ from tcpipe.formats.runs import LogOrigin, Run, find_lineage
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.calls import INGEST, record_call
 from tcpipe.pipeline.ingest import CallOptions, ingest
-from tcpipe.pipeline.log_sources import LogSource, find_sources
+from tcpipe.pipeline.log_sources import LogSource, list_log_sources
 from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
@@ -66,7 +66,7 @@ def make_many_runs(directory: Path, count: int) -> tuple[Path, Path]:
         call.begin()
         first = _add_first(store, one.manifest)
         call.state, table = store.scan(), first.table("segments")
-        for source in find_sources([logs.absolute()], as_one=False, staging=Path()).sources:
+        for source in list_log_sources([logs.absolute()], as_one=False, staging=Path()).sources:
             _add_copy(store, call.state, first, table, source)
         forget_tables(store, call.state, first.facts)
     return logs, root

@@ -29,7 +29,7 @@ from physics_model import PhysicsModel
 from tcpipe.errors import PathError
 from tcpipe.planning.cost_grid import COURSES, CostGrid, make_survey
 from tcpipe.planning.cost_map import make_cost_map, open_cost_map
-from tcpipe.planning.frames import find_projection
+from tcpipe.planning.frames import find_lonlat_projection
 from tcpipe.planning.path_cost import compute_path_cost
 from tcpipe.planning.plan import plan_path
 from tcpipe.planning.search import find_least_cost_paths, make_steps, straighten_path
@@ -139,7 +139,7 @@ def main() -> None:
     ratios: dict[str, list[float]] = {"Smac 2D": [], "straight lines": []}
 
     def cost_of(xy_m: Floats) -> float:
-        lonlat = find_projection(source).inverse(xy_m)
+        lonlat = find_lonlat_projection(source).inverse(xy_m)
         return compute_path_cost(MODEL, source, lonlat, where="path").totals.known_energy_joule
 
     while len(ratios["Smac 2D"]) < pairs:
@@ -149,7 +149,7 @@ def main() -> None:
         start, goal = (ends @ [grid.cols, 1]).tolist()
         xy_m = grid.xy_from_px(ends[:, ::-1].astype(np.float64))
         try:
-            best = plan_path(survey, *find_projection(source).inverse(xy_m), "energy").totals.known_energy_joule
+            best = plan_path(survey, *find_lonlat_projection(source).inverse(xy_m), "energy").totals.known_energy_joule
         except PathError:
             continue
         steps = make_steps(

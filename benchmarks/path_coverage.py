@@ -24,9 +24,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from adapted_drives import compare_adaptations
 
-from tcpipe.cost.adaptation import Metres, Run, predict
+from tcpipe.cost.adaptation import MeasuredRun, Metres, predict
 from tcpipe.cost.coverage import measure_coverage
-from tcpipe.cost.prediction_errors import COVERAGE, NORMAL_HALF_WIDTH, Errors
+from tcpipe.cost.prediction_errors import COVERAGE, NORMAL_HALF_WIDTH, QuantityErrors
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.training import train
@@ -65,7 +65,7 @@ def make_store(place: Path, site: SimulatedSite, layers: Mapping[str, Path] | No
     return store
 
 
-def measure(here: Path, seed: int, *, given: argparse.Namespace) -> tuple[Model, list[Run]]:
+def measure(here: Path, seed: int, *, given: argparse.Namespace) -> tuple[Model, list[MeasuredRun]]:
     """Return a model of some drives, and further drives as it predicts and they measured them."""
     site = simulate_drives(here / "train" / "site", given.train, given.metres, seed=seed)
     store = make_store(here / "train", site)
@@ -80,11 +80,11 @@ def measure(here: Path, seed: int, *, given: argparse.Namespace) -> tuple[Model,
     return model, collect_runs(model, source, opened, [run.run_id for run in opened.runs()])
 
 
-Found = list[tuple[dict[str, Errors], Run]]
+Found = list[tuple[dict[str, QuantityErrors], MeasuredRun]]
 """Further drives, each with the errors of the model that predicts it."""
 
 
-def list_paths(found: Found, quantity: str, length: int) -> Iterator[tuple[str, Errors, Metres]]:
+def list_paths(found: Found, quantity: str, length: int) -> Iterator[tuple[str, QuantityErrors, Metres]]:
     """Yield consecutive paths of a length along each drive, with its name and the model's errors."""
     for errors, run in found:
         metres = run.metres[quantity]

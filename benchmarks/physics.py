@@ -18,7 +18,7 @@ import pyarrow as pa
 from tcpipe import ingest
 from tcpipe.cost.physics import FitSamples, fit_and_validate_physics
 from tcpipe.formats.recipe_toml import load_recipe
-from tcpipe.pipeline.dataset.card import find_idle_power
+from tcpipe.pipeline.dataset.card import compute_mean_idle_power
 from tcpipe.report.label_sections import describe_physics
 from tcpipe.simulation import Faults, find_scenario, simulate
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
@@ -66,7 +66,7 @@ def of_simulation(robot: SimulatedRobot, *, metres: float, seed: int) -> Sequenc
         ingest(made.logs, store=Path(directory) / "store")
         run = Store(Path(directory) / "store").runs()[0]
         segments = run.segments()
-    found = fit_and_validate_physics(with_terrain(segments, chosen.world), idle_watt=find_idle_power(segments))
+    found = fit_and_validate_physics(with_terrain(segments, chosen.world), idle_watt=compute_mean_idle_power(segments))
     assert found is not None
     lines = [describe_physics("simulated robot", found)]
     weight = robot.mass_kg * GRAVITY_MPS2 / robot.drive_efficiency
@@ -94,7 +94,7 @@ def of_log(log: Path, recipe: Path | None) -> str:
     with tempfile.TemporaryDirectory() as directory:
         ingest([log], store=Path(directory) / "store", recipe=load_recipe(recipe))
         segments = Store(Path(directory) / "store").runs()[0].segments()
-    found = fit_and_validate_physics(make_fit_samples(segments), idle_watt=find_idle_power(segments))
+    found = fit_and_validate_physics(make_fit_samples(segments), idle_watt=compute_mean_idle_power(segments))
     return f"{log.name}: no fit" if found is None else describe_physics(log.stem, found)
 
 

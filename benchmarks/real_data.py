@@ -37,15 +37,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from adapted_drives import compare_adaptations
 
 from tcpipe import ingest
-from tcpipe.cost.adaptation import Metres, Run
+from tcpipe.cost.adaptation import MeasuredRun, Metres
 from tcpipe.cost.physics import ALL, FitSamples, fit_physics
-from tcpipe.cost.prediction_errors import Errors as PredictionErrors
+from tcpipe.cost.prediction_errors import QuantityErrors as PredictionErrors
 from tcpipe.cost.prediction_errors import fit_bias_correction, fit_errors
 from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.learning.metrics import (
     LEAST,
     LEAST_VELOCITY_MPS,
-    Errors,
+    QuantityErrors,
     Spread,
     compute_costs,
     compute_errors,
@@ -203,7 +203,7 @@ def adapted_lines(name: str, other: str, known: Metre, there: Metre) -> Iterator
             said["E"], there.power / there.velocity, np.zeros(len(ones), np.int64), np.cumsum(ones) - 1.0, ones, said["T"],
             there.rise, there.turn_radpm,
         )  # fmt: skip
-        runs = [Run(name, {"energy": metres})]
+        runs = [MeasuredRun(name, {"energy": metres})]
         for of in compare_adaptations({"energy": errors["energy"]}, runs, known_m):
             r2 = 1.0 - of.rmse**2 / float(np.var(metres.measured[-of.samples :]))
             yield (
@@ -264,7 +264,7 @@ def own_mean(of: Metre) -> Told:
     )
 
 
-def _row(names: tuple[str, ...], of: Errors, quantity: str, scatter: float) -> str:
+def _row(names: tuple[str, ...], of: QuantityErrors, quantity: str, scatter: float) -> str:
     unit, digits = UNITS[quantity]
     assert of.rmse is not None, "no labels"
     mape = "–" if of.mape_percent is None else f"{of.mape_percent:.1f} ({of.mape_count} of {of.count})"

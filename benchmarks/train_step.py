@@ -18,14 +18,14 @@ from tcpipe.dataset import open_dataset
 from tcpipe.learning.fitting import FitConfig, compute_loss_factors
 from tcpipe.learning.network import Trainer, make_resnet18
 from tcpipe.learning.network_model import NetworkModel
-from tcpipe.learning.training import make_samples
+from tcpipe.learning.training import make_training_samples
 
 STEPS, BATCH = 10, 64
 WANTED = 0.9
 
 
 def main() -> None:
-    samples = make_samples(open_dataset(sys.argv[1]), FitConfig(), NetworkModel)
+    samples = make_training_samples(open_dataset(sys.argv[1]), FitConfig(), NetworkModel)
     fit = samples.split.take(samples.folds != 0)
     width = int(sys.argv[2]) if len(sys.argv) > 2 else 64
     batches = fit.batches(BATCH, shuffle=True, mirror=True, drop_last=True)

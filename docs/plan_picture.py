@@ -18,7 +18,7 @@ from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.planning.plan import Plan
 from tcpipe.report.pictures import colour_classes, shade_heights
 from tcpipe.tables.columns import to_floats
-from tcpipe.terrain.tiles import MapReader, choose_level, read_window
+from tcpipe.terrain.tiles import MapReader, choose_level, read_tile_window
 
 Array = NDArray[np.float64]
 Bounds = tuple[float, float, float, float]
@@ -83,7 +83,7 @@ def _make_hill(source: MapReader, bounds: Bounds) -> Array:
     corners = level.grid.px_from_xy(np.array([(left, top), (right, bottom)])) + 0.5
     (col0, row0), (col1, row1) = np.floor(corners[0]).astype(int), np.ceil(corners[1]).astype(int)
     step, window = max(1, max(row1 - row0, col1 - col0) // _PANEL_PX), (int(row0), int(row1), int(col0), int(col1))
-    layers = {layer: read_window(level, layer, *window)[::step, ::step] for layer in level.layers}
+    layers = {layer: read_tile_window(level, layer, *window)[::step, ::step] for layer in level.layers}
     light = shade_heights(layers["height"].astype(np.float64), level.grid.pixel_size_m * step)
     is_missing = np.any([layers[name] == 0 for name in ("ortho", "terrain") if name in layers], axis=0)
     grey = layers["ortho"] / 255.0 if "ortho" in layers else np.full(light.shape, 0.7)

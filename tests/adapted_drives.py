@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tcpipe.cost.adaptation import Run, adapt, predict
-from tcpipe.cost.prediction_errors import Errors
+from tcpipe.cost.adaptation import MeasuredRun, adapt, predict
+from tcpipe.cost.prediction_errors import QuantityErrors
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ _LEAST_REST = 10
 
 
 def compare_adaptations(
-    errors: Mapping[str, Errors], runs: Sequence[Run], known_m: Sequence[float]
+    errors: Mapping[str, QuantityErrors], runs: Sequence[MeasuredRun], known_m: Sequence[float]
 ) -> Iterator[AdaptedErrors]:
     """Yield errors on the rest of each run after so many metres of it are known.
 

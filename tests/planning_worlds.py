@@ -3,7 +3,7 @@
 import numpy as np
 from map_worlds import ArrayMap
 
-from tcpipe.planning.frames import find_projection
+from tcpipe.planning.frames import find_lonlat_projection
 from tcpipe.terrain.target_grid import MapGrid
 
 WEST_M, NORTH_M = 500_000.0, 5_200_000.0
@@ -26,4 +26,4 @@ def plane(side_m=24.0, *, rise_east=0.0, rise_north=0.0, classes=None, pixel_siz
 def lonlat(source, *points):
     """Return lon, lat [deg] of points given east and north of the map's south-west corner [m], shape (P, 2)."""
     x_min, y_min, _, _ = source.grid.bounds_m
-    return find_projection(source).inverse(np.array(points, np.float64) + np.array([x_min, y_min]))
+    return find_lonlat_projection(source).inverse(np.array(points, np.float64) + np.array([x_min, y_min]))

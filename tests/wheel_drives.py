@@ -6,7 +6,7 @@ import numpy as np
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.status import find_status
+from tcpipe.pipeline.status import find_log_states
 from tcpipe.recipe import Recipe
 
 START_NS = 1_700_000_000_000_000_000
@@ -37,4 +37,4 @@ def drive_at(path: Path, **how) -> Path:
 
 def ask_status(store, *logs, **how):
     """Return the status of logs, or of those that were ingested before."""
-    return find_status(IngestOptions(logs, store=store, **{"recipe": Recipe(), "min_age": 600.0, **how}))
+    return find_log_states(IngestOptions(logs, store=store, **{"recipe": Recipe(), "min_age": 600.0, **how}))

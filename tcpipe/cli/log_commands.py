@@ -69,9 +69,9 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     if not as_json:
         print_line(f"recipe: {source}")
     if dry_run:
-        from tcpipe.pipeline.status import find_status
+        from tcpipe.pipeline.status import find_log_states
 
-        planned = find_status(options, create=True)
+        planned = find_log_states(options, create=True)
         print_result(replace(planned, history=()), as_json=as_json)
         return 0
     with show_progress("ingest", quiet=quiet, as_json=as_json) as shown:
@@ -235,7 +235,7 @@ def status(
     """
     from tcpipe.formats.finding_lines import format_finding
     from tcpipe.formats.object_storage import is_url
-    from tcpipe.pipeline.status import find_status as run
+    from tcpipe.pipeline.status import find_log_states as run
     from tcpipe.store import is_store
 
     if paths and is_store(paths[0]):

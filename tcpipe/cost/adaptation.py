@@ -22,7 +22,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import stdtrit
 
 from tcpipe.arrays import Floats
-from tcpipe.cost.prediction_errors import COVERAGE, NORMAL_HALF_WIDTH, Errors, SumDistribution
+from tcpipe.cost.prediction_errors import COVERAGE, NORMAL_HALF_WIDTH, QuantityErrors, SumDistribution
 
 _CHANGES = {0.0: 0.7, 0.1: 0.15, 0.3: 0.15}
 """Prior probability of each standard deviation q of a relative change."""
@@ -62,7 +62,7 @@ class Metres:
 
     @property
     def ground(self) -> tuple[Floats, NDArray[np.integer], Floats | None, NDArray[np.bool_] | None]:
-        """Return the arguments of the methods of `Errors`."""
+        """Return the arguments of the methods of `QuantityErrors`."""
         return self.predicted, self.class_id, self.stated_std, self.is_near
 
 
@@ -76,13 +76,13 @@ class Adapted:
     total: SumDistribution
 
 
-def predict(errors: Errors, there: Metres) -> Adapted:
+def predict(errors: QuantityErrors, there: Metres) -> Adapted:
     """Return the predictions of metres without adaptation."""
     low, high = errors.compute_intervals(*there.ground)
     return Adapted(there.predicted, low, high, errors.compute_sum(*there.ground))
 
 
-def adapt(errors: Errors, known: Metres, there: Metres) -> Adapted:
+def adapt(errors: QuantityErrors, known: Metres, there: Metres) -> Adapted:
     """Return the predictions of metres, adapted by one or more measured metres of the same run or robot.
 
     Metres without a prediction are NaN and in no sum.
@@ -142,7 +142,7 @@ def _mix(weights: Floats, values: Floats, variances: Floats) -> tuple[Floats, Fl
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class MeasuredRun:
     """Measured metres of a run, by quantity (``duration``, ``energy``), in order."""
 
     name: str

@@ -109,7 +109,7 @@ class SumDistribution:
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
+class QuantityErrors:
     """Errors of one quantity's centred predictions.
 
     Attributes
@@ -139,7 +139,7 @@ class Errors:
     common_share: float = 0.0
     stated_share: float = 0.0
     usual_stated: float = 0.0
-    near: Errors | None = None
+    near: QuantityErrors | None = None
     """Errors near training ground, the others being away from it; None where too few held-out samples are near others."""
 
     def compute_std(self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None) -> Floats:
@@ -227,7 +227,7 @@ def _fit_bias_correction(held: _Held) -> BiasCorrection:
     return BiasCorrection(*(_fit_bias(held.predicted[name], held.true[name], held) for name in ("duration", "energy")))
 
 
-def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
+def fit_errors(residuals: Residuals) -> dict[str, QuantityErrors] | None:
     """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
     ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted; where known
@@ -251,7 +251,7 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     return {name: replace(errors, near=near[name]) for name, errors in away.items()}
 
 
-def _fit_quantities(residuals: Residuals, held: _Held) -> dict[str, Errors]:
+def _fit_quantities(residuals: Residuals, held: _Held) -> dict[str, QuantityErrors]:
     """Return the errors of each quantity, centred by their own bias."""
     correction = _fit_bias_correction(held)
     power, velocity = correction.apply(held.predicted["power"], held.predicted["velocity"], held.class_id)
@@ -434,7 +434,7 @@ _ONE_FOLD_FREEDOM = 5.0
 """Degrees of freedom of the spread of errors of one fold."""
 
 
-def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Floats, stated: Floats) -> Errors:
+def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Floats, stated: Floats) -> QuantityErrors:
     error = true - predicted
     design = np.column_stack([np.ones_like(predicted), np.abs(predicted), stated])
     shares, _ = nnls(design, np.abs(error))
@@ -450,7 +450,7 @@ def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Fl
     runs = int(np.unique(held.run).size)
     wider = float(stdtrit(_ONE_FOLD_FREEDOM, 1.0 - _TAIL)) / NORMAL_HALF_WIDTH if held.is_one_fold else 1.0
     floor, share, stated_share = (float(part) * scale * wider for part in shares)
-    found = Errors(
+    found = QuantityErrors(
         floor, share, of_class, min(low, 0.0), max(high, 0.0), bias_std, lag_m, correlation, 0.0, runs, standard.size,
         stated_share=stated_share, usual_stated=float(stated.mean()),
     )  # fmt: skip
@@ -459,7 +459,7 @@ def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Fl
     )
 
 
-def _estimate_run_variance(errors: Errors, error: Floats, spread: Floats, run: Ints) -> float:
+def _estimate_run_variance(errors: QuantityErrors, error: Floats, spread: Floats, run: Ints) -> float:
     """Return the variance of a run's own error over its spread, beyond what errors of its metres leave in its mean.
 
     It is raised so that a normal interval of the mean error of a new run is as wide as Student's t wants it. Runs count by their length

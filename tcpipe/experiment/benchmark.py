@@ -32,7 +32,7 @@ from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Ratio, mean_k
 from tcpipe.learning.predictions import compute_cost_errors, make_column_name
 from tcpipe.learning.predictor import find_kind
 from tcpipe.learning.training import train
-from tcpipe.report.page import Section, render_page
+from tcpipe.report.page import PageSection, render_page
 from tcpipe.tables.columns import to_floats, to_texts
 
 logger = logging.getLogger("tcpipe")
@@ -141,7 +141,7 @@ def run_benchmark(
             rows += _summarize(name, kind, made, tables, runs, float(np.mean(times_s)))
     values = Benchmark(rows=tuple(rows))
     write_json(place / JSON, values)
-    sections = [Section(title, header=header, rows=table) for title, header, table in list_tables(values.rows)]
+    sections = [PageSection(title, header=header, rows=table) for title, header, table in list_tables(values.rows)]
     lead = "Errors of every kind of model; intervals are of 95 %, over runs and trainings."
     write_text(place / PAGE, render_page(title="Benchmark", lead=lead, numbers=[], sections=sections))
     return BenchmarkResult(place, values, evaluations)

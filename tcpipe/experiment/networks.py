@@ -23,7 +23,7 @@ from tcpipe.learning.models import load_model
 from tcpipe.learning.network_model import NetworkModel
 from tcpipe.learning.predictions import Measured, Predicted, collect_measured, predict_costs
 from tcpipe.learning.predictor import Fitted, Job, Prediction, Samples, find_held_out, predict_samples
-from tcpipe.learning.training import make_samples
+from tcpipe.learning.training import make_training_samples
 
 logger = logging.getLogger("tcpipe")
 
@@ -75,8 +75,8 @@ def compare_networks(model: Path, dataset: Path, place: Path, *, seed: int) -> t
         return known.results
     place.mkdir(parents=True, exist_ok=True)
     data, fitted = open_dataset(dataset, label=ours.card.label_energy), ours.card.training.samples["fitted"]
-    train = make_samples(data, ours.card.training.config, NetworkModel)
-    heights = make_samples(data, replace(ours.card.training.config, layers=("height",)), NetworkModel)
+    train = make_training_samples(data, ours.card.training.config, NetworkModel)
+    heights = make_training_samples(data, replace(ours.card.training.config, layers=("height",)), NetworkModel)
     energy = replace(heights.inputs, outputs=(heights.split.energy.energy,))
     of_energy = EnergySamples(heights.split, energy, heights.config, heights.idle_watt)
     names = {entry.id: entry.name for entry in ours.card.class_table.classes}

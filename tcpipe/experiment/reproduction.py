@@ -23,7 +23,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
-from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.page import Number, PageSection, render_page
 from tcpipe.simulation import SimulatedSite, find_scenario, simulate
 
 logger = logging.getLogger("tcpipe")
@@ -175,7 +175,8 @@ def _render_page(values: ReproductionSummary, runs: Sequence[Evaluation]) -> str
     claims = values.claims
     audits = (f"{split}: {part.leakage or UNKNOWN_DISTANCE}" for split, part in runs[0].splits.items())
     tables = [
-        Section(title, header=header, rows=rows, folded=True) for title, header, rows in list_tables(values.benchmark)
+        PageSection(title, header=header, rows=rows, folded=True)
+        for title, header, rows in list_tables(values.benchmark)
     ]
     return render_page(
         title="The paper's experiment on a simulated site",
@@ -189,7 +190,7 @@ def _render_page(values: ReproductionSummary, runs: Sequence[Evaluation]) -> str
     )
 
 
-def _make_claims_section(claims: Sequence[Claim], audit: str) -> Section:
+def _make_claims_section(claims: Sequence[Claim], audit: str) -> PageSection:
     rows = [
         (
             claim.says, claim.split, claim.verdict, str(claim.ratio),
@@ -205,4 +206,4 @@ def _make_claims_section(claims: Sequence[Claim], audit: str) -> Section:
         f"construction of the site, so they are no claims. {audit}"
     )
     header = ("claim", "split", "", "here", "between trainings (1σ)", "the paper")
-    return Section("Claims of the paper", text, header=header, rows=rows)
+    return PageSection("Claims of the paper", text, header=header, rows=rows)

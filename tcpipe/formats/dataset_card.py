@@ -325,7 +325,6 @@ class DatasetCard:
     covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
     added_columns: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
-    """A sample of two lists counts for the first one."""
     without_coordinates: bool = field(default=False, metadata={"json": (False,)})
     """Whether places are metres from an unpublished origin; then names, times, maps and regions are omitted too."""
     shards: tuple[Shard, ...]

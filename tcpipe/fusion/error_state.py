@@ -37,8 +37,8 @@ from tcpipe.fusion.filter_kernel import (
     NONE,
     REJECTED,
     RESET,
+    FilterModel,
     Memory,
-    Model,
     Tests,
     allocate_steps,
     filter_ticks,
@@ -204,7 +204,7 @@ class SectionModel:
 
     def prepare(
         self, start: Memory, hypothesis: Hypothesis = _UNCHANGED, *, judges: bool = False
-    ) -> tuple[Ticks, Model, Memory]:
+    ) -> tuple[Ticks, FilterModel, Memory]:
         """Return ticks, model and start of a pass under a hypothesis; see `filter`."""
         ticks = hypothesis.alter_ticks(self.ticks)
         std, walk, time_s = make_priors(self.measurements, self.noise, ticks)
@@ -318,7 +318,7 @@ def _list_blocks(size: int) -> list[tuple[int, int]]:
     return list(pairwise([*range(0, size, _BLOCK), size]))
 
 
-def filter_section(ticks: Ticks, model: Model, start: Memory, *, until: int | None = None) -> Pass:
+def filter_section(ticks: Ticks, model: FilterModel, start: Memory, *, until: int | None = None) -> Pass:
     """Return the forward pass from a start, over all ticks or those before ``until``."""
     size = min(until or ticks.stamp_ns.size, ticks.stamp_ns.size)
     made = Pass(ticks, model, [], make_tests(size), np.zeros((size, state.NX)), start.copy())

@@ -48,7 +48,7 @@ NONE, ACCEPTED, REJECTED, RESET = range(4)
 Indices = NDArray[np.int64]
 
 
-class Inputs(NamedTuple):
+class TickInputs(NamedTuple):
     """All that a section measures, by tick k of K; see `tcpipe.fusion.ticks`.
 
     Attributes
@@ -82,7 +82,7 @@ class Inputs(NamedTuple):
     attitude: Matrix
 
 
-class Model(NamedTuple):
+class FilterModel(NamedTuple):
     """What the filter assumes.
 
     Attributes
@@ -210,7 +210,7 @@ def _draw_sigma_point(i: int, m: int, active: Indices, places: Indices, L: Matri
 
 
 @compile_kernel
-def _move(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, F: Matrix, room: Any) -> None:
+def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, F: Matrix, room: Any) -> None:
     """Carry x and P over the motion of tick k; F becomes the map of the errors on which it depends."""
     L, M, W, missed, d, high, low, centre, turn, up, down = room
     mode = inputs.mode[k]
@@ -263,7 +263,7 @@ def _move(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, F: Matrix,
 
 
 @compile_kernel
-def _decay(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, kept: Vector) -> None:
+def _decay(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, kept: Vector) -> None:
     """Let parameters decay and wander over tick k; begin its events. ``kept`` becomes the share that stays of each error."""
     n = P.shape[0]
     for i in range(n):
@@ -290,7 +290,15 @@ def _decay(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, kept: Vec
 
 @compile_kernel
 def _compare(
-    k: int, kind: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, acceleration: Vector, gain: Any, room: Any
+    k: int,
+    kind: int,
+    inputs: TickInputs,
+    model: FilterModel,
+    x: Vector,
+    P: Matrix,
+    acceleration: Vector,
+    gain: Any,
+    room: Any,
 ) -> float:
     """Fill innovation, H, P H', S and S⁻¹ of one measurement; return log det S."""
     y, H, Hs, cross, S, inverse = gain
@@ -451,8 +459,8 @@ def _widen(kind: int, P: Matrix, y: Vector, size: int, scale: int) -> None:
 def filter_ticks(
     first: int,
     last: int,
-    inputs: Inputs,
-    model: Model,
+    inputs: TickInputs,
+    model: FilterModel,
     memory: Memory,
     keep: bool,
     steps: Steps,

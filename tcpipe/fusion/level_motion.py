@@ -160,7 +160,7 @@ def compute_levelling_rotations(up: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class OdometryTrack:
     """Track of one odometry on the grid of its attitude.
 
     Attributes
@@ -193,16 +193,16 @@ def integrate_grid(rate: NDArray[_Number]) -> NDArray[_Number]:
     return total
 
 
-def make_free_track(forward_mps: Floats, attitude: Attitude) -> Track:
+def make_free_track(forward_mps: Floats, attitude: Attitude) -> OdometryTrack:
     """Return a track in the level frame, aligned with nothing."""
     path = integrate_grid(forward_mps[:, None] * attitude.rotation[:, :, 0])
     level = np.hypot(attitude.rotation[:, 0, 0], attitude.rotation[:, 1, 0])
-    return Track(forward_mps * level, attitude.yaw_rad, path, np.zeros_like(path))
+    return OdometryTrack(forward_mps * level, attitude.yaw_rad, path, np.zeros_like(path))
 
 
 def align_tracks(
     forward_mps: Mapping[str, Floats], gnss: Positions, attitude: Attitude, zero_ns: int
-) -> dict[str, Track]:
+) -> dict[str, OdometryTrack]:
     """Return the tracks of odometries in the frame of the fixes; none where the fixes show no motion.
 
     Heading, arm and time offset of the odometry that follows the fixes best also hold for the others; each has its own scale.
@@ -326,7 +326,7 @@ class _Alignment:
             )
         return fit
 
-    def make_track(self, forward: Floats, fit: _Fit) -> Track:
+    def make_track(self, forward: Floats, fit: _Fit) -> OdometryTrack:
         """Return the aligned track, its pitch corrected by the fixes' heights."""
         velocity, arm = self._horizontal(forward, fit)
         speed = fit.scale * forward
@@ -336,7 +336,7 @@ class _Alignment:
         path = integrate_grid(np.stack((velocity.real, velocity.imag, climb), -1))
         level = np.abs(velocity) * np.sign(speed)
         heading = self._attitude.yaw_rad + fit.turn_rad
-        return Track(level, heading, path, np.stack((arm.real, arm.imag, self._arm_m[:, 2]), -1))
+        return OdometryTrack(level, heading, path, np.stack((arm.real, arm.imag, self._arm_m[:, 2]), -1))
 
     def _fit_pitch(self, speed: Floats, climb: Floats) -> Floats:
         """Return the slow error of pitch [rad] on the grid (n,) with which the track climbs as the fixes do."""

@@ -244,11 +244,11 @@ def select_measurements(whole: Measurements, start_ns: int, end_ns: int) -> Meas
     found: dict[str, Sensor | None] = {}
     for role, source in whole.sensors().items():
         rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
-        found[role] = select_rows(source, rows) if rows.stop > rows.start else None
+        found[role] = select_sensor_rows(source, rows) if rows.stop > rows.start else None
     return whole.replace_sensors(found)
 
 
-def select_rows(source: _Source, rows: slice | NDArray[np.bool_]) -> _Source:
+def select_sensor_rows(source: _Source, rows: slice | NDArray[np.bool_]) -> _Source:
     """Return a sensor with some of its rows."""
     values = {field.name: getattr(source, field.name) for field in fields(source)}
     chosen: dict[str, Any] = {name: value[rows] for name, value in values.items() if isinstance(value, np.ndarray)}

@@ -21,7 +21,7 @@ from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.fusion.level_motion import (
     STEP_S,
     Attitude,
-    Track,
+    OdometryTrack,
     align_tracks,
     average_grid,
     compute_forward_mps,
@@ -134,7 +134,9 @@ def find_residuals(measurements: Measurements) -> list[Residuals]:
     return residuals
 
 
-def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, speed_mps: Floats) -> list[Residuals]:
+def _compare_fixes(
+    section: _Section, gnss: Positions, role: str, track: OdometryTrack, speed_mps: Floats
+) -> list[Residuals]:
     """Return the residuals of fixes against an aligned track; ``speed_mps`` (n,) shows whether the robot moves."""
     attitude = section.attitude
     fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
@@ -180,7 +182,9 @@ def _describe_fixes(gnss: Positions, axis: str, first: Ints, last: Ints, time_s:
     return features
 
 
-def _compare_odometries(section: _Section, pair: tuple[str, str], first: Track, second: Track) -> list[Residuals]:
+def _compare_odometries(
+    section: _Section, pair: tuple[str, str], first: OdometryTrack, second: OdometryTrack
+) -> list[Residuals]:
     """Return the residuals of two odometries along the heading of the first, the second scaled to it."""
     rows, at_ns, time_s = section.rows, section.at_ns, section.attitude.time_s
     at_s = time_s[rows]
@@ -224,7 +228,7 @@ def _integrate_process(weight: Floats, window_s: float, tau_s: float) -> Floats:
 class _Window:
     """The path of a track within windows of one length."""
 
-    def __init__(self, track: Track, attitude: Attitude, start_s: Floats, end_s: Floats) -> None:
+    def __init__(self, track: OdometryTrack, attitude: Attitude, start_s: Floats, end_s: Floats) -> None:
         self._span = (start_s, end_s)
         self._yaw = attitude.yaw_rad
         self.time_s = float(np.median(end_s - start_s))

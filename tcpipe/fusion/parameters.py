@@ -14,7 +14,7 @@ import numpy as np
 from tcpipe.arrays import Floats
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel, Prior
-from tcpipe.fusion.filter_kernel import MOTION_WITH_GYRO, MOTION_WITHOUT_GYRO, Memory, Model
+from tcpipe.fusion.filter_kernel import MOTION_WITH_GYRO, MOTION_WITHOUT_GYRO, FilterModel, Memory
 from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements, Positions
 from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, is_length_observable, turn_scale_std
 from tcpipe.fusion.signals import find_chi_square_threshold
@@ -190,7 +190,7 @@ def make_model(
     follows: bool = True,
     time_s: Floats | None = None,
     possible: Sequence[int] = (),
-) -> Model:
+) -> FilterModel:
     """Return the filter's model; unless it ``follows``, rejected fixes are never taken to be right after all.
 
     ``possible``: errors that other events could change.
@@ -211,7 +211,7 @@ def make_model(
     scales = np.full(state.KINDS, -1, np.int64)
     scales[state.WHEELS] = position.get(state.WHEEL_SCALE, -1)
     scales[state.VISUAL] = position.get(state.VISUAL_SCALE, -1)
-    return Model(
+    return FilterModel(
         active=active,
         depends=depends,
         counts=counts,

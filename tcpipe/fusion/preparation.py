@@ -24,7 +24,7 @@ from tcpipe.fusion.measurements import (
     GroundVelocities,
     InertialMeasurements,
     Positions,
-    select_rows,
+    select_sensor_rows,
 )
 from tcpipe.fusion.signals import (
     compute_median_period_ns,
@@ -166,13 +166,13 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     lasting = kept_ns >= max(_FROZEN_NS, 2 * compute_median_period_ns(stamp_ns[first]))
     if odometry is None:
         kept = changes | np.repeat(lasting, last - first + 1)
-        return (gnss if kept.all() else select_rows(gnss, kept)), ()
+        return (gnss if kept.all() else select_sensor_rows(gnss, kept)), ()
     zero = int(stamp_ns[0])
     speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
     driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
     frozen = np.flatnonzero(lasting & (driven_m[last] - driven_m[first] > _MIN_MOVING_MPS * kept_ns * 1e-9))
     found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
-    return select_rows(gnss, changes), tuple(found)
+    return select_sensor_rows(gnss, changes), tuple(found)
 
 
 def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Positions, Floats]:

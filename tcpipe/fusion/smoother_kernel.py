@@ -26,10 +26,10 @@ from tcpipe.compiled import compile_kernel
 from tcpipe.fusion.filter_kernel import (
     MOTION_WITH_GYRO,
     MOTION_WITHOUT_GYRO,
+    FilterModel,
     Indices,
-    Inputs,
-    Model,
     Steps,
+    TickInputs,
     factorize,
     turn_rows,
 )
@@ -192,7 +192,15 @@ def step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint
 
 @compile_kernel
 def _smooth_tick(
-    k: int, P: Matrix, x: Vector, model: Model, adjoint: Adjoint, lags: Indices, out: Smoothed, A: Matrix, room: Any
+    k: int,
+    P: Matrix,
+    x: Vector,
+    model: FilterModel,
+    adjoint: Adjoint,
+    lags: Indices,
+    out: Smoothed,
+    A: Matrix,
+    room: Any,
 ) -> None:
     """Fill the smoothed estimate at tick k."""
     information, rows, ticks, ends, near = adjoint
@@ -330,8 +338,8 @@ def _score_events(k: int, adjoint: Adjoint, candidates: Candidates, B: Matrix, L
 def smooth_ticks(
     first: int,
     last: int,
-    inputs: Inputs,
-    model: Model,
+    inputs: TickInputs,
+    model: FilterModel,
     steps: Steps,
     states: Matrix,
     lags: Indices,

@@ -20,7 +20,7 @@ from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
 from tcpipe.fusion.dead_reckoning import compute_course_rate
 from tcpipe.fusion.densities import DETERMINED, NoiseModel
-from tcpipe.fusion.filter_kernel import Inputs, Memory, Model, Tests
+from tcpipe.fusion.filter_kernel import FilterModel, Memory, Tests, TickInputs
 from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import (
     DOPPLER_LASTS_S,
@@ -67,7 +67,7 @@ class Ticks:
     """
 
     stamp_ns: Ints
-    inputs: Inputs
+    inputs: TickInputs
     rows: dict[int, Ints]
     fix_variance_m2: Floats
 
@@ -77,7 +77,7 @@ class Pass:
     """One forward pass over a section: its model, checkpoints, tests, and filtered states by tick."""
 
     ticks: Ticks
-    model: Model
+    model: FilterModel
     checkpoints: list[Memory]
     tests: Tests
     states: Floats
@@ -165,7 +165,7 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
         if m.imu.accelerometer_usable:
             mode[by_gyro] = state.INERTIAL
     kept, fix_noise = _make_fix_process(noise, fix_variance, period_s)
-    inputs = Inputs(
+    inputs = TickInputs(
         period_s,
         mode,
         turned,

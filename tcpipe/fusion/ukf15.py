@@ -19,7 +19,7 @@ from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
 from tcpipe.fusion.changes import Hypothesis
 from tcpipe.fusion.error_state import make_tests, make_trajectory, prepare_section
-from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Memory, Model
+from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, FilterModel, Memory
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S, InitialState, Measurements, Trajectory
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed
 from tcpipe.fusion.ticks import Pass, Ticks
@@ -58,7 +58,7 @@ def run_ukf15(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_p
     return replace(found, facts=replace(found.facts, parameters=parameters))
 
 
-def filter_forward(ticks: Ticks, model: Model, start: Memory) -> tuple[Pass, Smoothed]:
+def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pass, Smoothed]:
     """Return the forward pass over all ticks, and its estimate, without variances of displacements (NaN).
 
     If the gate has rejected all measurements of one kind for 5 s (and five of them), the errors that they measure are inflated by the
@@ -96,7 +96,7 @@ def filter_forward(ticks: Ticks, model: Model, start: Memory) -> tuple[Pass, Smo
 class _Filter:
     """The estimate ``x``, shape (51,), and filterpy's filter of its active errors, from tick to tick."""
 
-    def __init__(self, ticks: Ticks, model: Model, start: Memory) -> None:
+    def __init__(self, ticks: Ticks, model: FilterModel, start: Memory) -> None:
         size = model.active.size
         # The points lie at √3 σ whatever the number of errors, and match the fourth moment of a normal distribution.
         points = MerweScaledSigmaPoints(size, alpha=np.sqrt(3.0 / size), beta=2.0, kappa=0.0)

@@ -22,7 +22,7 @@ from tcpipe.learning.models import Model
 from tcpipe.learning.physics_model import MeanModel
 from tcpipe.learning.predictions import Measured, Predicted
 from tcpipe.learning.predictor import Job, Prediction, Predictor, Samples, find_kind, predict_samples
-from tcpipe.learning.training import make_samples
+from tcpipe.learning.training import make_training_samples
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 logger = logging.getLogger("tcpipe")
@@ -112,7 +112,7 @@ def _fit_baseline(kind: type[Predictor], train: Split, data: Dataset) -> tuple[S
     )
     if kind.features is None:  # trees take the turn, but not the commanded speed
         kind = type(kind.__name__, (kind,), {"features": turn})
-    samples = make_samples(data, FitConfig(), kind, train)
+    samples = make_training_samples(data, FitConfig(), kind, train)
     try:
         fitted = kind.fit_folds(samples, Job("", Path()))
     except ModelError:

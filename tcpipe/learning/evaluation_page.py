@@ -26,7 +26,7 @@ from tcpipe.learning.predictor import find_kind
 from tcpipe.report.colours import FAINT, choose_class_colours
 from tcpipe.report.page import (
     Number,
-    Section,
+    PageSection,
     Shaded,
     render_page,
     show_verdict,
@@ -50,7 +50,7 @@ def render_evaluation_page(found: Evaluation, table: pa.Table) -> str:
     name, of_power = found.dataset.name, found.model.label_energy
     note = "" if of_power == "total" else f" (w and E {ENERGIES[of_power].words})"
     costs = "time T and energy E" if "E" in found.costs else "time T"
-    paper = Section(
+    paper = PageSection(
         "Comparison with the paper",
         "The paper's tables with the figures of this model; 'tcpipe benchmark' and 'reproduce' add its other networks.\n"
         + COUNTED,
@@ -99,11 +99,11 @@ def _format_measure(measure: str, quantity: str) -> str:
     return f"{MEASURES[measure]} [{'%' if measure == 'mape_percent' else UNITS[quantity]}]"
 
 
-def _make_baselines_section(found: Evaluation) -> Section:
+def _make_baselines_section(found: Evaluation) -> PageSection:
     """Return the model and the baselines, with the ratio of their errors."""
     title, splits = "Comparison with baselines", found.ordered_splits
     if not found.baselines:
-        return Section(title)
+        return PageSection(title)
     by_cell = {(row.baseline, row.split, row.quantity): row for row in found.baselines}
     names = list(dict.fromkeys(row.baseline for row in found.baselines))
     rows: list[tuple[str, ...]] = []
@@ -128,10 +128,10 @@ def _make_baselines_section(found: Evaluation) -> Section:
         "All are centred by class with the same rule, from their own held-out predictions (evaluation.json has all ratios). "
         "Intervals: paired bootstrap over runs or blocks, ten at least. Physics and boosting also know the turn of each segment."
     )
-    return Section(title, text, header=header, rows=rows)
+    return PageSection(title, text, header=header, rows=rows)
 
 
-def _make_coverage_section(found: Evaluation) -> Section:
+def _make_coverage_section(found: Evaluation) -> PageSection:
     """Return the coverage of 90 % intervals with its own interval, and the scores of the stated errors."""
     rows = [
         (
@@ -148,7 +148,7 @@ def _make_coverage_section(found: Evaluation) -> Section:
         and error.crps is not None
     ]
     if not rows:
-        return Section("Uncertainty", "The model states no uncertainty: too few samples were held out.")
+        return PageSection("Uncertainty", "The model states no uncertainty: too few samples were held out.")
     training = found.model.training
     is_network, count = find_kind(training.kind).stops_by_fold, training.samples["held out"]
     held_out = (
@@ -159,7 +159,7 @@ def _make_coverage_section(found: Evaluation) -> Section:
         "binomial, clustered by run."
     )
     header = ("", "", "inside the 90 % interval", "NLL [nat]", "CRPS")
-    return Section("Uncertainty", text, header=header, rows=rows)
+    return PageSection("Uncertainty", text, header=header, rows=rows)
 
 
 def _format_coverage(coverage: Coverage) -> str:
@@ -171,7 +171,7 @@ def _format_coverage(coverage: Coverage) -> str:
     return f"{100 * coverage.fraction:.1f} %{interval}"
 
 
-def _make_class_sections(found: Evaluation) -> list[Section]:
+def _make_class_sections(found: Evaluation) -> list[PageSection]:
     """Return tables I and II."""
     sections = []
     for number, split in zip(("I", "II"), SPLITS, strict=True):
@@ -180,7 +180,7 @@ def _make_class_sections(found: Evaluation) -> list[Section]:
         part = found.splits[split]
         rows = [row for quantity in found.costs for row in _iterate_class_rows(found, split, quantity)]
         header = ("", "", *(f"{name} ({part.classes[name]})" for name in part.class_order), f"all ({part.samples})")
-        sections.append(Section(f"Table {number}: {_CALLED[split]}", _TEXT[split], header=header, rows=rows))
+        sections.append(PageSection(f"Table {number}: {_CALLED[split]}", _TEXT[split], header=header, rows=rows))
     return sections
 
 
@@ -207,7 +207,7 @@ _TEXT = {
 }
 
 
-def _make_other_sections(found: Evaluation) -> list[Section]:
+def _make_other_sections(found: Evaluation) -> list[PageSection]:
     """Return tables III and V: other inputs, the expected time."""
     ablation = {
         "+".join(row.layers): {split: row.errors[split]["E"] for split in found.ordered_splits}
@@ -229,7 +229,7 @@ def _make_other_section(
     found: Evaluation,
     quantity: Literal["E", "T"],
     errors: Mapping[str, Mapping[str, Errors]],
-) -> Section:
+) -> PageSection:
     """Return errors of a quantity by predictor, on every split, beside the paper's."""
     splits = found.ordered_splits
     rows: list[tuple[str, ...]] = []
@@ -240,7 +240,7 @@ def _make_other_section(
             values = (value for split in splits for value in PAPER[name][SPLITS.index(split)])
             rows.append(("", "paper", *map(_format_paper_figure, values)))
     header = ("", "", *(f"{split}, {_format_measure(measure, quantity)}" for split in splits for measure in MEASURES))
-    return Section(title, text, header=header, rows=rows)
+    return PageSection(title, text, header=header, rows=rows)
 
 
 CLASSES = ("grass", "mud", "unpaved road", "paved road", "all")
@@ -287,7 +287,7 @@ _WHOLE_JOULE = 10.0
 """RMSE of E from which whole joules are printed [J], so that nine ranges of slope fit."""
 
 
-def draw_predictions(table: pa.Table, audit: str) -> Section:
+def draw_predictions(table: pa.Table, audit: str) -> PageSection:
     """Return a point for each sample, E and T; ``audit`` says how far they are from training."""
     text = "Each point is a segment, coloured by class; on the line the prediction is exact. Point at one for its name."
     drawn = table.slice(0, _MOST_DRAWN)
@@ -318,14 +318,14 @@ def draw_predictions(table: pa.Table, audit: str) -> Section:
         ends = [float(label[known].min()), float(label[known].max())]
         plot.figure.line(ends, ends, color=FAINT, line_width=2, line_dash="dashed")
         plots.append(plot)
-    return Section("Measured against predicted", f"{text}\n{audit}", plots=plots)
+    return PageSection("Measured against predicted", f"{text}\n{audit}", plots=plots)
 
 
 def _read_slope_deg(table: pa.Table) -> NDArray[np.float64]:
     return np.degrees(to_floats(table, "slope_rad"))
 
 
-def make_worst_section(table: pa.Table) -> Section:
+def make_worst_section(table: pa.Table) -> PageSection:
     """Return the samples of each split with the largest errors of E, or of T without energy, largest first."""
     worst, quantity = table.take(pa.array(find_worst_rows(table, _WORST))), find_main_cost(table)
     off, slope = compute_cost_errors(worst, quantity), _read_slope_deg(worst)
@@ -340,10 +340,10 @@ def make_worst_section(table: pa.Table) -> Section:
         "Look for a common cause: a wrong class in the map, a step missing in the heights, a label with a large σ.\n"
         "'tcpipe explain SAMPLE' says where a sample came from."
     )
-    return Section("Worst segments", text, header=header, rows=rows, folded=True)
+    return PageSection("Worst segments", text, header=header, rows=rows, folded=True)
 
 
-def make_slope_section(table: pa.Table) -> Section:
+def make_slope_section(table: pa.Table) -> PageSection:
     """Return the RMSE of E, or of T without energy, by split, class and range of slope, as a heat map."""
     part, quantity = table.filter(pc.is_valid(table.column("slope_rad"))), find_main_cost(table)
     off = compute_cost_errors(part, quantity)
@@ -380,4 +380,4 @@ def make_slope_section(table: pa.Table) -> Section:
     )
     header = ["split", "class", *(_SLOPE_NAMES[at].replace(" to ", "…") for at in columns)]
     rows = [[*line, *(shade((*line, at)) for at in columns)] for line in sorted(lines)]
-    return Section("Error by class and slope", text, header=header, rows=rows)
+    return PageSection("Error by class and slope", text, header=header, rows=rows)

@@ -22,7 +22,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats32
-from tcpipe.cost.prediction_errors import Errors, estimate_correlation, fit_errors
+from tcpipe.cost.prediction_errors import QuantityErrors, estimate_correlation, fit_errors
 from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
 from tcpipe.errors import ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import write_text
@@ -91,7 +91,7 @@ class Model:
         return any(feature.name == "turn_radpm" for feature in self.card.inputs.extra_features)
 
     @cached_property
-    def errors(self) -> dict[str, Errors] | None:
+    def errors(self) -> dict[str, QuantityErrors] | None:
         """Return the errors on held-out samples; None if they are too few."""
         return fit_errors(self.residuals)
 

@@ -120,7 +120,7 @@ def fit_physics_model(extra_features: ExtraFeatures, labels: Floats, *, idle_wat
     )
 
 
-def find_idle_power(split: Split) -> float | None:
+def compute_idle_power(split: Split) -> float | None:
     """Return what the robot draws while it stands, of the power that a split's labels are of [W]; None where no run of it stood."""
     if split.energy is not ENERGIES["total"]:
         return 0.0

@@ -29,7 +29,7 @@ from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, compute_costs
 from tcpipe.learning.model_card import KIND, LayerRange, ModelCard, TrainedOn, Training, TrainingRange
 from tcpipe.learning.models import CARD, FILES, GROUND_COLUMNS, load_model, write_model
 from tcpipe.learning.own_models import load_own_kind, report_errors
-from tcpipe.learning.physics_model import find_idle_power
+from tcpipe.learning.physics_model import compute_idle_power
 from tcpipe.learning.predictor import (
     AUTOMATIC,
     Fitted,
@@ -101,7 +101,7 @@ def choose_kind(data: Dataset, config: FitConfig, split: Split | None = None) ->
     for name in AUTOMATIC:
         kind = find_kind(name)
         try:
-            samples = make_samples(data, config, kind, split)
+            samples = make_training_samples(data, config, kind, split)
             losses[name] = _compute_losses(samples, cross_predict(kind, samples, part).mean)
         except ModelError as error:
             logger.info("%s is not compared: %s", name, error.problems[0])
@@ -179,7 +179,7 @@ def train(
         logger.log(level, "%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, name)
     else:
         _report_layers(data, rules.layers or data["train"].channels, is_chosen=bool(rules.layers))
-    samples = make_samples(data, rules, kind)
+    samples = make_training_samples(data, rules, kind)
     _reject_other_files(out)
     with report_errors(own):
         fitted = kind.fit_folds(samples, Job(str(out), checkpoint))
@@ -241,7 +241,9 @@ def select_train(data: Dataset, rules: FitConfig, kind: type[Predictor] = Predic
     return train.with_channels(*channels) if channels else train
 
 
-def make_samples(data: Dataset, rules: FitConfig, kind: type[Predictor], train: Split | None = None) -> Samples:
+def make_training_samples(
+    data: Dataset, rules: FitConfig, kind: type[Predictor], train: Split | None = None
+) -> Samples:
     """Return the samples of a kind of model: labelled samples ``train``, or all that `select_train` finds, which need folds."""
     needs_folds = train is None
     if train is None:
@@ -267,7 +269,7 @@ def make_samples(data: Dataset, rules: FitConfig, kind: type[Predictor], train: 
         channels=train.channels, patch_px=data.card.patch_px, planes=train.view.form.planes, patch_m=data.card.patch_m,
         class_count=read_class_table(data.card).count, extra_features=extra_features, outputs=outputs, scale=(),
     )  # fmt: skip
-    samples = Samples(train, inputs, rules, find_idle_power(train))
+    samples = Samples(train, inputs, rules, compute_idle_power(train))
     return replace(samples, inputs=replace(inputs, scale=tuple(map(float, samples.labels.max(axis=0)))))
 
 

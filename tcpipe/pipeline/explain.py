@@ -107,8 +107,7 @@ class History:
     masks: tuple[NearbyMask, ...]
     rejected: tuple[NearbyRefusal, ...]
     map: MapSource | None
-    """None without patches."""
-    """The map from which its patch was sampled, as the card of the dataset has it."""
+    """The map from which its patch was sampled, as the card of the dataset has it; None without patches."""
     recipe_differs_in: Mapping[str, Setting]
     """Keys of the recipe that differ from their default."""
     versions: Versions

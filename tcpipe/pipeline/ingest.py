@@ -26,12 +26,20 @@ from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
     find_failure,
-    find_sources,
+    list_log_sources,
     make_definitions_key,
     select_shard,
 )
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.plan import IngestResult, IngestTask, PlannedLog, check_age, make_died_result, make_result, plan
+from tcpipe.pipeline.plan import (
+    IngestResult,
+    IngestTask,
+    PlannedLog,
+    check_age,
+    make_died_result,
+    make_result,
+    plan_ingestion,
+)
 from tcpipe.pipeline.problems import is_acknowledged
 from tcpipe.recipe import Recipe, TimeWindow
 from tcpipe.store import is_store, open_store
@@ -151,7 +159,7 @@ def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path, *, is_
     robot = options.robot or ruling.robot
     if robot is not None and robot not in (robots := load_profiles(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
-    found = find_sources(list(options.logs), as_one=options.as_one, staging=staging, tables=ruling.tables)
+    found = list_log_sources(list(options.logs), as_one=options.as_one, staging=staging, tables=ruling.tables)
     if not found.sources:
         raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
     own = found.sources if shard is None else [found.sources[at] for at in select_shard(found.sources, shard)]
@@ -167,7 +175,7 @@ def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path, *, is_
             if options.on_result:
                 options.on_result(result)
 
-    steps = plan(tasks, call.state)
+    steps = plan_ingestion(tasks, call.state)
     _announce_new_results(steps, call.state)
     tell(chain(_iterate_missing(found), _iterate_finished(call.state, steps)))
     if any(step.is_todo for step in steps):

@@ -120,7 +120,7 @@ class FoundLogs:
     """Whether what is in the way of a path may pass: a network that is down."""
 
 
-def find_sources(
+def list_log_sources(
     logs: Iterable[str | Path], *, as_one: bool, staging: Path, tables: Mappings | None = None
 ) -> FoundLogs:
     """Return the logs at or below the given paths.

@@ -227,7 +227,7 @@ def make_planner(state: State) -> Callable[[IngestTask], PlannedLog]:
     return partial(_decide, known=known, now_ns=time.time_ns())
 
 
-def plan(tasks: Iterable[IngestTask], state: State) -> tuple[PlannedLog, ...]:
+def plan_ingestion(tasks: Iterable[IngestTask], state: State) -> tuple[PlannedLog, ...]:
     """Return what each log needs."""
     return tuple(map(make_planner(state), tasks))
 

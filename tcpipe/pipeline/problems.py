@@ -11,7 +11,7 @@ from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.runs import Call, Problem, Run, RunFacts, find_problems, make_failure
 from tcpipe.pipeline.calls import ACKNOWLEDGE, BUILD, INGEST, close_call, list_open_calls, record_call
-from tcpipe.pipeline.log_sources import find_sources
+from tcpipe.pipeline.log_sources import list_log_sources
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Subject, make_finding
 
@@ -162,7 +162,7 @@ def _make_missing_problem(name: str, state: State) -> list[Problem]:
     if path is None:
         return []
     with make_scratch_directory() as staging:
-        return [make_missing(path, state)] if find_sources([path], as_one=False, staging=staging).problems else []
+        return [make_missing(path, state)] if list_log_sources([path], as_one=False, staging=staging).problems else []
 
 
 def _describe_no_match(

@@ -289,13 +289,13 @@ def propose_tables(path: Path) -> ProposedRecipe:
     Of several tables for a role, that is used which covers the drive of the others best. Tables that contradict others in the first minute
     are comments.
     """
-    from tcpipe.formats.logs.table_log import read_column_names  # noqa: PLC0415  polars only where a table is read
+    from tcpipe.formats.logs.table_log import read_table_header  # noqa: PLC0415  polars only where a table is read
 
     folder, files = (path, list_table_files(path)) if path.is_dir() else (path.parent, [path])
     columns, head = dict[Path, Sequence[str]](), [""]
     for file in files:
         try:
-            columns[file] = read_column_names(file)
+            columns[file] = read_table_header(file)
         except LogError as error:
             head.append(str(error))
     tables, roles = list[_Table](), defaultdict[str, list[tuple[_Table, list[ProposedLine]]]](list)

@@ -27,9 +27,9 @@ from tcpipe.pipeline.calls import (
     list_open_calls,
 )
 from tcpipe.pipeline.ingest import CallOptions, make_tasks
-from tcpipe.pipeline.log_sources import find_sources, select_shard
+from tcpipe.pipeline.log_sources import list_log_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, PlannedLog, plan
+from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, PlannedLog, plan_ingestion
 from tcpipe.pipeline.problems import (
     find_incomplete_maps,
     find_incomplete_runs,
@@ -106,7 +106,7 @@ class Status:
         return clean_lines([*lines, *(_format_call(call) for call in self.history[:_MOST_CALLS])])
 
 
-def find_status(options: IngestOptions, *, create: bool = False) -> Status:
+def find_log_states(options: IngestOptions, *, create: bool = False) -> Status:
     """Return what a call of ingest with these options would find; with ``create`` the store need not be there.
 
     Without logs: those that the latest calls of ingest were given, with the options of these calls. A log that was written more recently
@@ -121,7 +121,7 @@ def find_status(options: IngestOptions, *, create: bool = False) -> Status:
     if not given and not state.calls:
         raise UsageError(f"{opened.root}: no earlier call of ingest is known; give the logs or their folders")
     tasks, missing = _find_tasks(options, asked, opened.root, ruling)
-    steps = plan(tasks, state)
+    steps = plan_ingestion(tasks, state)
     open_calls, acknowledged = list_open_calls(state), state.acknowledged
     killed = [call for call in open_calls if call.state == "killed"]
     lately = given or next(iter(asked.values()), ((), CallOptions()))[0]
@@ -185,7 +185,7 @@ def _find_tasks(
     tasks, missing = list[IngestTask](), dict[str, tuple[str, ...]]()
     for mine, again in groups:
         with make_scratch_directory() as staging:
-            found = find_sources(mine, as_one=again.as_one, staging=staging, tables=recipe.tables)
+            found = list_log_sources(mine, as_one=again.as_one, staging=staging, tables=recipe.tables)
         missing |= found.problems
         new = make_tasks(found.sources, again, root, recipe)
         new = new if options.shard is None else [new[at] for at in select_shard(found.sources, options.shard)]

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats32
-from tcpipe.cost.prediction_errors import Errors
+from tcpipe.cost.prediction_errors import QuantityErrors
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, lock_directory, make_scratch_directory, write_text
 from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as, write_sealed
@@ -319,7 +319,7 @@ class _Strips:
     """Rows of a quantity, from the costs, the errors of the model's predictions and the class of each cell."""
 
     costs: CostGrid
-    errors: Mapping[str, Errors] | None
+    errors: Mapping[str, QuantityErrors] | None
     class_id: NDArray[np.uint8]
 
     def compute(self, name: str, first: int, last: int) -> Floats32:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tcpipe import __version__
-from tcpipe.cost.adaptation import Metres, Run, predict
+from tcpipe.cost.adaptation import MeasuredRun, Metres, predict
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.dataset import Dataset
@@ -120,7 +120,7 @@ def predict_run(
     gnss_crs: str | None = None,
     sample: SampleConfig | None = None,
     shift: Sequence[float] = (0.0, 0.0, 0.0),
-) -> tuple[Run, Reasons]:
+) -> tuple[MeasuredRun, Reasons]:
     """Return the predictions and labels of a run's segments in order, and the reasons against the comparison of each.
 
     ``gnss_crs`` is of the fixes (None: as the run was ingested); ``sample`` limits the position's standard deviation; ``shift`` moves the
@@ -160,12 +160,12 @@ def predict_run(
             said.reasons, uncertain, np.isfinite(measured + values["duration_s"]), strict=True
         )
     ]
-    return Run(run.run_id, metres), reasons
+    return MeasuredRun(run.run_id, metres), reasons
 
 
 def collect_runs(
     model: Model, source: MapFile, store: Store, logs: Sequence[str], data: Dataset | None = None
-) -> list[Run]:
+) -> list[MeasuredRun]:
     """Return the labelled segments of drives on ground that the model knows, predicted and measured; `UsageError` if one has none.
 
     They may be of another robot, payload or season: a model is adapted by them. They are moved onto the map as the dataset's recipe says
@@ -173,7 +173,7 @@ def collect_runs(
     """
     runs = [find_drive(store, log) for log in logs]
     recipe = replace(Recipe(), read=runs[0].manifest.recipe.read) if data is None else data.card.recipe
-    shifts, collected = find_shifts(source, recipe, runs)[0], list[Run]()
+    shifts, collected = find_shifts(source, recipe, runs)[0], list[MeasuredRun]()
     for run in runs:
         shift = shifts.get(run.run_id, (0.0, 0.0, 0.0))
         found, reasons = predict_run(model, source, run, sample=recipe.sample, shift=shift)
@@ -183,7 +183,7 @@ def collect_runs(
             raise UsageError(
                 f"run {run.run_id}: no labelled segment on ground that {model.name} knows to adapt it by ({named})"
             )
-        collected.append(Run(run.run_id, {name: metres.take(is_good) for name, metres in found.metres.items()}))
+        collected.append(MeasuredRun(run.run_id, {name: metres.take(is_good) for name, metres in found.metres.items()}))
     return collected
 
 

@@ -26,7 +26,7 @@ _SLIVER = 0.05
 """Share of a cell at the edge of a map that makes no cell of its own."""
 
 
-def find_projection(source: MapReader) -> Projection:
+def find_lonlat_projection(source: MapReader) -> Projection:
     """Return the operation from WGS 84 lon, lat [deg] to the map's CRS."""
     return find_map_projection(source, "EPSG:4326")
 
@@ -41,7 +41,7 @@ class Frame:
 
     @cached_property
     def _projection(self) -> Projection:
-        return find_projection(self.source)
+        return find_lonlat_projection(self.source)
 
     def to_lonlat(self, xy_m: Floats) -> Floats:
         """Return longitude and latitude [deg] of points of the frame, shape (N, 2)."""
@@ -97,7 +97,7 @@ class Frame:
 def make_frame(source: MapReader, origin_deg: tuple[float, float] | None) -> Frame:
     """Return the frame of a robot; `UsageError` where its origin is not near the map."""
     if origin_deg is not None:
-        x_m, y_m = find_projection(source).forward(np.array([origin_deg]))[0].tolist()
+        x_m, y_m = find_lonlat_projection(source).forward(np.array([origin_deg]))[0].tolist()
         x_min, y_min, x_max, y_max = source.grid.bounds_m
         off_m = np.hypot(x_m - np.clip(x_m, x_min, x_max), y_m - np.clip(y_m, y_min, y_max))
         if not off_m <= _FARTHEST_ORIGIN_M:

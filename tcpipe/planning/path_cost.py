@@ -12,7 +12,7 @@ from pyarrow import csv
 from pyproj import Geod
 
 from tcpipe.arrays import Floats
-from tcpipe.cost.adaptation import Adapted, Metres, Run, adapt, predict
+from tcpipe.cost.adaptation import Adapted, MeasuredRun, Metres, adapt, predict
 from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution
 from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
@@ -28,8 +28,8 @@ from tcpipe.planning.cost_model import (
     count_reasons,
     predict_segments,
 )
-from tcpipe.planning.frames import find_projection
-from tcpipe.planning.search import Turning, compute_turns, find_turning
+from tcpipe.planning.frames import find_lonlat_projection
+from tcpipe.planning.search import Turning, compute_course_changes, find_turning
 from tcpipe.splits.audit import PLACES, compute_middles
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import Column, TableSchema
@@ -100,7 +100,7 @@ def compute_path_cost(
     lonlat_deg: Floats,
     *,
     where: str,
-    known: Run | None = None,
+    known: MeasuredRun | None = None,
     shortest_m: float | None = None,
 ) -> PathCost:
     """Return the cost of a path by the model, adapted by the metres of a run if one is given.
@@ -120,7 +120,7 @@ def compute_path_cost(
     frames = segments.frames(model.card.chord_m)
     if not count_corners_on(source.grid, compute_footprints(frames, model.card.inputs.patch_m)).any():
         raise PathError(describe_off_map(source, where, lonlat_deg))
-    turn_rad = compute_turns(segments.start_xy_m, segments.end_xy_m)
+    turn_rad = compute_course_changes(segments.start_xy_m, segments.end_xy_m)
     turn_radpm = turn_rad / segments.arc_m
     usual_radpm = 0.0 if model.card.physics is None else model.card.physics.mean_turn_radpm
     turn_radpm[turn_radpm <= usual_radpm] = np.nan  # as usual: nobody drives as straight as a line is drawn
@@ -133,7 +133,7 @@ def _cut_into_segments(
     source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str, shortest_m: float | None
 ) -> PathSegments:
     """Return the path segments of a path; `PathError` where it is shorter than one, or than ``shortest_m``."""
-    projection = find_projection(source)
+    projection = find_lonlat_projection(source)
     xy_m = projection.forward(lonlat_deg)
     if not np.isfinite(xy_m).all():
         raise PathError(f"{where}: points are outside the area where the CRS of map {source.name} is defined")
@@ -161,7 +161,7 @@ def _sum_costs(  # noqa: PLR0917
     segments: PathSegments,
     said: SegmentPredictions,
     turn_rad: Floats,
-    known: Run | None,
+    known: MeasuredRun | None,
 ) -> PathCost:
     class_id, errors, turning = said.terrain_class, model.errors, find_added_turning(model)
     nothing = np.full(len(class_id), np.nan)
@@ -237,7 +237,7 @@ def _sum_costs(  # noqa: PLR0917
 
 def _locate_segments(source: MapReader, segments: PathSegments) -> dict[str, Floats]:
     """Return columns of the places of path segments."""
-    projection = find_projection(source)
+    projection = find_lonlat_projection(source)
     start, end = (projection.inverse(xy_m) for xy_m in (segments.start_xy_m, segments.end_xy_m))
     azimuth_deg, _, _ = Geod(ellps="WGS84").inv(start[:, 0], start[:, 1], end[:, 0], end[:, 1])
     return {
@@ -254,7 +254,7 @@ def _locate_segments(source: MapReader, segments: PathSegments) -> dict[str, Flo
 
 def describe_off_map(source: MapReader, where: str, lonlat_deg: Floats) -> str:
     """Return a message for points, shape (P, 2), off the map: its extent, and whether their axes are swapped."""
-    west, south, east, north = compute_area(find_projection(source).target, source.grid.bounds_m)
+    west, south, east, north = compute_area(find_lonlat_projection(source).target, source.grid.bounds_m)
     lat, lon = lonlat_deg.T
     swapped = bool(((lon >= west) & (lon <= east) & (lat >= south) & (lat <= north)).any())
     hint = (

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.adaptation import Run
+from tcpipe.cost.adaptation import MeasuredRun
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.errors import MapError, ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside
@@ -119,7 +119,7 @@ def find_doubts(totals: PathTotals, path: Subject) -> Iterator[Finding]:
 
 
 def predict_path(
-    model: Model, source: MapFile, path: Path, out: Path | None, *, adapted_by: Run | None = None
+    model: Model, source: MapFile, path: Path, out: Path | None, *, adapted_by: MeasuredRun | None = None
 ) -> PathResult:
     """Return the cost of the line in a GeoJSON file; write its path segments to ``out`` and the totals beside it.
 

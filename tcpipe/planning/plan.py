@@ -20,16 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Mask
-from tcpipe.cost.prediction_errors import Errors
+from tcpipe.cost.prediction_errors import QuantityErrors
 from tcpipe.errors import ModelError, PathError
 from tcpipe.formats.json_files import convert_record
 from tcpipe.planning.cost_grid import BARRED, COURSES, LazyCostGrid
 from tcpipe.planning.cost_model import Reason
-from tcpipe.planning.frames import find_projection
+from tcpipe.planning.frames import find_lonlat_projection
 from tcpipe.planning.path_cost import PathCost, PathTotals, compute_path_cost, describe_off_map
 from tcpipe.planning.search import (
+    GridSteps,
     LeastCostPath,
-    Steps,
     find_best_potential,
     find_least_cost_paths,
     find_turning,
@@ -131,7 +131,7 @@ def plan_path(
             f"{survey.model.name}: has too few held-out samples for errors, which --risk and --budget need"
         )
     ends_deg = np.stack([start_deg, goal_deg])
-    projection = find_projection(survey.source)
+    projection = find_lonlat_projection(survey.source)
     search = _Search(survey, projection.forward(ends_deg), ends_deg, allow_extrapolation, step)
     search.check_ends()
     search.predict_ground()
@@ -272,9 +272,9 @@ class _Search:
         self,
         objective: Objective,
         class_id: Classes | None = None,
-        errors: Errors | None = None,
+        errors: QuantityErrors | None = None,
         caution: float = 0.0,
-    ) -> tuple[Steps, tuple[LeastCostPath, ...]]:
+    ) -> tuple[GridSteps, tuple[LeastCostPath, ...]]:
         """Return the steps over predicted cells and the best paths over them; with the cells' classes, that with turns comes first."""
         costs, (start, goal) = self.survey.costs, self._cells.tolist()
         open_ = costs.open_courses(allow_extrapolation=self.allow_extrapolation) & self.survey.predicted
@@ -290,7 +290,9 @@ class _Search:
         turning = find_turning(self.survey.model.card.physics, self.survey.model.card.class_table)
         return steps, find_least_cost_paths(steps, find_best_potential(steps), start, goal, turning, class_id)
 
-    def find_finalists(self, objective: Objective, errors: Mapping[str, Errors] | None) -> tuple[list[Floats], int]:
+    def find_finalists(
+        self, objective: Objective, errors: Mapping[str, QuantityErrors] | None
+    ) -> tuple[list[Floats], int]:
         """Return the lines of paths that may be the best, (P, 2) each, and the free steps of the search for the objective.
 
         They are the best of each objective, and with ``errors`` those of little risk.
@@ -306,7 +308,7 @@ class _Search:
                 lines += self._draw_lines(*self._find(objective, class_id, of_cell, caution))
         return list({np.round(line, 3).tobytes(): line for line in lines}.values()), negative
 
-    def _draw_lines(self, steps: Steps, paths: tuple[LeastCostPath, ...]) -> Iterator[Floats]:
+    def _draw_lines(self, steps: GridSteps, paths: tuple[LeastCostPath, ...]) -> Iterator[Floats]:
         """Yield each path in the map's CRS [m], from end to end as they were given: as its steps, and as straight lines that cost less."""
         grid = self.survey.costs.grid
         for path in paths:

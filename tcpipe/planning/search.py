@@ -46,7 +46,7 @@ _STEEPEST_PER_M = 1e5
 _PRECISION = 1e-3
 
 
-class Steps(NamedTuple):
+class GridSteps(NamedTuple):
     """Inputs of the costs of all steps between neighbouring cells, for compiled kernels.
 
     Attributes
@@ -82,7 +82,7 @@ class LeastCostPath:
     """Steps that gain more energy than their height explains; they cost nothing."""
 
 
-def make_steps(costs: CostGrid, per_metre: NDArray[np.float32], open_: NDArray[np.bool_], metres: Floats) -> Steps:
+def make_steps(costs: CostGrid, per_metre: NDArray[np.float32], open_: NDArray[np.bool_], metres: Floats) -> GridSteps:
     """Return every step along every course.
 
     Parameters
@@ -102,7 +102,7 @@ def make_steps(costs: CostGrid, per_metre: NDArray[np.float32], open_: NDArray[n
         crossed[course] = [(cell.north, cell.east) for cell in cells]
         shares[course] = [cell.share for cell in cells]
         shares[course, : 4 - len(find_crossed_cells(course))] = 0.0
-    return Steps(
+    return GridSteps(
         merged,
         np.nan_to_num(costs.height_m.astype(np.float64), nan=float(np.median(known_m)) if known_m.size else 0.0),
         np.hypot(*MOVES.T) * costs.grid.pixel_size_m * metres,
@@ -112,7 +112,7 @@ def make_steps(costs: CostGrid, per_metre: NDArray[np.float32], open_: NDArray[n
 
 
 @compile_kernel
-def compute_step(steps: Steps, k: float, course: int, row: int, col: int) -> float:
+def compute_step(steps: GridSteps, k: float, course: int, row: int, col: int) -> float:
     """Return the cost of a step without the grade ``k``, from a cell along a course; infinite where it cannot be made."""
     rows, cols, _ = steps.per_metre.shape
     row1, col1 = row - steps.crossed[course, 3, 0], col + steps.crossed[course, 3, 1]
@@ -131,7 +131,7 @@ def compute_step(steps: Steps, k: float, course: int, row: int, col: int) -> flo
 
 
 @compile_kernel
-def _bin_by_grade(steps: Steps, low: float, high: float, cheapest: Floats) -> tuple[float, float]:
+def _bin_by_grade(steps: GridSteps, low: float, high: float, cheapest: Floats) -> tuple[float, float]:
     """Write the cheapest metre of known steps of each bin of grade from ``low`` to ``high``; return the least and the greatest grade."""
     rows, cols, courses = steps.per_metre.shape
     least, greatest = np.inf, -np.inf
@@ -150,7 +150,7 @@ def _bin_by_grade(steps: Steps, low: float, high: float, cheapest: Floats) -> tu
     return least, greatest
 
 
-def find_best_potential(steps: Steps) -> float:
+def find_best_potential(steps: GridSteps) -> float:
     """Return k, the potential a metre of height, that makes the cheapest metre of known steps as dear as can be: a concave search.
 
     Metres of about the same grade are taken as their cheapest at either end of the bin, so that a step is never dearer than it is.
@@ -170,7 +170,7 @@ def find_best_potential(steps: Steps) -> float:
 
 
 @compile_kernel
-def _fill_costs(steps: Steps, k: float, goal: int, out: Floats) -> int:
+def _fill_costs(steps: GridSteps, k: float, goal: int, out: Floats) -> int:
     """Write the least cost from each cell to the goal to ``out``, (cells,), infinite before; return the number of free steps."""
     rows, cols, courses = steps.per_metre.shape
     negative = 0
@@ -227,7 +227,7 @@ def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
     return Turning(joule_per_rad, fit.mean_turn_radpm)
 
 
-def compute_turns(start_xy_m: Floats, end_xy_m: Floats) -> Floats:
+def compute_course_changes(start_xy_m: Floats, end_xy_m: Floats) -> Floats:
     """Return how far each of N path segments turns [rad], shape (N,): half of the change of course at either of its ends, shape (N, 2).
 
     It compares the courses of chords, so that jitter of the drawn points is no turn.
@@ -246,7 +246,7 @@ _STEP, _LEFT, _RIGHT, _START = 1, 2, 3, 4
 
 @compile_kernel
 def _find_turning(  # noqa: PLR0917
-    steps: Steps, k: float, joule_per_rad: Floats, class_id: Classes, turns_rad: Floats,
+    steps: GridSteps, k: float, joule_per_rad: Floats, class_id: Classes, turns_rad: Floats,
     to_goal: Floats, start: int, goal: int, labels: Floats, arrived: NDArray[np.int8],
 ) -> int:  # fmt: skip
     """Find the least cost with turns by A*; return the last state, a cell times 16 plus a course, or -1.
@@ -285,7 +285,7 @@ def _find_turning(  # noqa: PLR0917
 
 
 def find_least_cost_paths(  # noqa: PLR0917
-    steps: Steps, k: float, start: int, goal: int, turning: Turning | None = None, class_id: Classes | None = None
+    steps: GridSteps, k: float, start: int, goal: int, turning: Turning | None = None, class_id: Classes | None = None
 ) -> tuple[LeastCostPath, ...]:
     """Return the least-cost path from a cell to another (flat indices); an empty tuple without one.
 
@@ -308,7 +308,7 @@ def find_least_cost_paths(  # noqa: PLR0917
     return tuple(paths)
 
 
-def _trace_back(state: int, arrived: NDArray[np.int8], steps: Steps, k: float) -> tuple[Ints, float, float]:
+def _trace_back(state: int, arrived: NDArray[np.int8], steps: GridSteps, k: float) -> tuple[Ints, float, float]:
     """Return the cells of the path to a state of the search with turns, and what its steps cost, with and without the grade."""
     cells, raw, reduced = [state // COURSES], 0.0, 0.0
     while (way := int(arrived[state])) != _START:
@@ -329,7 +329,7 @@ SAMPLES_A_CELL = 4
 
 @compile_kernel
 def find_best_lines(  # noqa: PLR0917
-    steps: Steps, angles: Floats, metres: Floats, points: Floats, window: int, so_far: Floats, before: Ints
+    steps: GridSteps, angles: Floats, metres: Floats, points: Floats, window: int, so_far: Floats, before: Ints
 ) -> None:
     """Write the cost from the first point to each point of a path, and where its last line begins, to ``so_far`` and ``before``, (P,).
 
@@ -391,7 +391,7 @@ _MOST_SAMPLES = 3e7
 _PASSES = 4
 
 
-def straighten_path(steps: Steps, points_px: Floats) -> Floats:
+def straighten_path(steps: GridSteps, points_px: Floats) -> Floats:
     """Return the points of the cheapest path of straight lines between points of a path.
 
     ``points_px`` are the path's points [cells], centres are integers, shape (P, 2).

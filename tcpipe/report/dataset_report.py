@@ -36,7 +36,7 @@ from tcpipe.report.page import (
     Column,
     Link,
     Number,
-    Section,
+    PageSection,
     make_shown_column,
     pack_columns,
     render_page,
@@ -106,7 +106,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, sample
         sections=[
             _make_map_section(shown, card.samples, plots),
             *([_SELECTION] if samples.num_rows else []),
-            Section(
+            PageSection(
                 "Labels",
                 parts=[
                     make_quality_section(quality, "samples"),
@@ -114,7 +114,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, sample
                     *make_budget_sections(card.energy_budget),
                 ],
             ),
-            Section(
+            PageSection(
                 "Distance breakdown",
                 "Used and excluded distances add up to the odometer.",
                 plots=[waterfall],
@@ -129,7 +129,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, sample
     )
 
 
-_SELECTION = Section(
+_SELECTION = PageSection(
     "Selected samples", "Patches and table show the selection. Travel is to the right.", controls="selection.html"
 )
 
@@ -145,14 +145,14 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
     ]
 
 
-def _make_map_section(shown: SamplesShown, count: int, plots: list[Plot]) -> Section:
+def _make_map_section(shown: SamplesShown, count: int, plots: list[Plot]) -> PageSection:
     text = "Dashed: region of the split; the buffer is in no split. A click selects the nearest sample, with shift one more; "
     text += "a drag in the plot or the histogram selects all within. Filters combine."
     if len(shown.xy_m) < count:
         text += f" Of {count} samples {len(shown.xy_m)}, drawn at random, are shown."
     if not len(shown.xy_m):
-        return Section("The samples on the map", "There is none.")
-    return Section("The samples on the map", text, controls="dataset.html", plots=plots)
+        return PageSection("The samples on the map", "There is none.")
+    return PageSection("The samples on the map", text, controls="dataset.html", plots=plots)
 
 
 def _make_data(
@@ -197,7 +197,7 @@ def _find_run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
     return found
 
 
-def _make_audit_section(card: DatasetCard) -> Section:
+def _make_audit_section(card: DatasetCard) -> PageSection:
     rows = [
         (
             part.split,
@@ -215,16 +215,16 @@ def _make_audit_section(card: DatasetCard) -> Section:
     counts = ("samples", "overlap train", "neighbours of train", "places near train")
     header = ("split", *counts, "nearest train", "median")
     text = "Held-out samples near training samples. On the map: colour by distance to the nearest training sample, or tick its lines."
-    return Section("Leakage audit", text, header=header, rows=rows)
+    return PageSection("Leakage audit", text, header=header, rows=rows)
 
 
-def _make_class_sections(card: DatasetCard) -> list[Section]:
+def _make_class_sections(card: DatasetCard) -> list[PageSection]:
     names = sorted({name for counts in card.terrain.values() for name in counts})
     rows = [(name, *(card.terrain[split].get(name, 0) for split in SPLIT_COLOURS)) for name in names]
-    return [Section("Samples by class", header=("class", *SPLIT_COLOURS), rows=rows)] if rows else []
+    return [PageSection("Samples by class", header=("class", *SPLIT_COLOURS), rows=rows)] if rows else []
 
 
-def _make_run_section(card: DatasetCard, hrefs: Mapping[str, str]) -> Section:
+def _make_run_section(card: DatasetCard, hrefs: Mapping[str, str]) -> PageSection:
     runs = [
         (
             Link(run.run_id, hrefs[run.run_id]) if run.run_id in hrefs else run.run_id,
@@ -239,10 +239,10 @@ def _make_run_section(card: DatasetCard, hrefs: Mapping[str, str]) -> Section:
     if hrefs:
         text = "Links lead to the pages of the runs, once 'tcpipe report STORE' has written them."
     header = ("run", "robot", "log", "samples", "noise floor of E")
-    return Section("Runs", text, header=header, rows=runs)
+    return PageSection("Runs", text, header=header, rows=runs)
 
 
-def _make_provenance_section(card: DatasetCard) -> Section:
+def _make_provenance_section(card: DatasetCard) -> PageSection:
     """Return the inputs from which the dataset can be built again."""
     rules = card.recipe.split
     rows = [
@@ -264,7 +264,7 @@ def _make_provenance_section(card: DatasetCard) -> Section:
         ("creator", card.creator or "none given"),
     ]
     text = "The same inputs give the same dataset; dataset.json contains its recipe and the checksum of every file."
-    return Section("Provenance", text, header=("what", "is"), rows=rows, folded=True)
+    return PageSection("Provenance", text, header=("what", "is"), rows=rows, folded=True)
 
 
 def find_nearest_train_m(xy_m: Floats, split: NDArray[np.integer]) -> tuple[Floats, NDArray[np.int32]]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.finding_lines import advise_on_loss, format_budget
 from tcpipe.motion.distance_breakdown import find_largest_losses
-from tcpipe.report.page import Section
+from tcpipe.report.page import PageSection
 from tcpipe.report.plots import draw_waterfall
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.facts import EnergyBudget, Floor, PhysicsFit, PhysicsTerm
@@ -43,7 +43,7 @@ QUALITY_WORDS = {
 """Meaning of each bit."""
 
 
-def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *, names_runs: bool) -> list[Section]:
+def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *, names_runs: bool) -> list[PageSection]:
     """Return the largest losses of distance of runs with their remedies; none without a run."""
     if not ledgers_m:
         return []
@@ -61,7 +61,7 @@ def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *,
     total_m = Counter[str]()
     for distance_by_reason_m in ledgers_m:
         total_m.update(distance_by_reason_m)
-    return [Section("Distance breakdown", text, header=header, rows=rows, plots=[draw_waterfall(total_m)])]
+    return [PageSection("Distance breakdown", text, header=header, rows=rows, plots=[draw_waterfall(total_m)])]
 
 
 def find_distinguishing_bits(bits: NDArray[np.integer]) -> int:
@@ -70,14 +70,14 @@ def find_distinguishing_bits(bits: NDArray[np.integer]) -> int:
     return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
 
 
-def make_quality_section(bits: NDArray[np.integer], noun: str) -> Section:
+def make_quality_section(bits: NDArray[np.integer], noun: str) -> PageSection:
     """Return how many labels carry each quality bit."""
     counts = {flag_name(bit).replace("_", " "): int(((bits & int(bit)) != 0).sum()) for bit in Quality}
     rows = [item for item in counts.items() if item[1]]
     if not rows:
-        return Section("Quality flags", f"None: all {noun} are clean.")
+        return PageSection("Quality flags", f"None: all {noun} are clean.")
     text = "A label may have several flags; docs/reference/columns.md explains them."
-    return Section("Quality flags", text, header=("flag", noun), rows=rows)
+    return PageSection("Quality flags", text, header=("flag", noun), rows=rows)
 
 
 _BUDGET_ROWS = {
@@ -92,14 +92,14 @@ _BUDGET_ROWS = {
 }
 
 
-def make_budget_sections(budget: EnergyBudget | None) -> list[Section]:
+def make_budget_sections(budget: EnergyBudget | None) -> list[PageSection]:
     """Return the section on the noise floor of E; none where no segment has an energy."""
     if budget is None:
         return []
     shares = {text: getattr(budget, name) for name, text in _BUDGET_ROWS.items()}
     rows = [(text, f"{100 * share:.2f} %") for text, share in shares.items()]
     title = "Uncertainty of labels"
-    return [Section(title, format_budget(budget), header=("from", "of E"), rows=rows)]
+    return [PageSection(title, format_budget(budget), header=("from", "of E"), rows=rows)]
 
 
 _ASIDE = {"grade": "weight over efficiency"}
@@ -139,16 +139,16 @@ def _format_with_std(term: PhysicsTerm) -> str:
     return f"{term.value:.{digits}f} ± {term.std:.{digits}f}"
 
 
-def make_physics_sections(fits: Mapping[str, PhysicsFit]) -> list[Section]:
+def make_physics_sections(fits: Mapping[str, PhysicsFit]) -> list[PageSection]:
     """Return the section on the fits by robot, if any."""
     text = " ".join(describe_physics(robot, fit) for robot, fit in fits.items())
-    return [Section("Power by cause: idle, drivetrain, rolling, grade, turning", text)] if fits else []
+    return [PageSection("Power by cause: idle, drivetrain, rolling, grade, turning", text)] if fits else []
 
 
 _UNITS = {"watt": "W", "mps": "m/s", "s": "s", "joule": "J"}
 
 
-def make_repeatability_section(repeatability: Mapping[str, Floor | None]) -> Section:
+def make_repeatability_section(repeatability: Mapping[str, Floor | None]) -> PageSection:
     """Return the repeatability of labels, the lower bound of model errors."""
     rows = []
     for label, entry in repeatability.items():
@@ -164,4 +164,4 @@ def make_repeatability_section(repeatability: Mapping[str, Floor | None]) -> Sec
         else "No place was driven twice in the same direction; drive some ground twice to measure the repeatability of labels."
     )
     header = ("label", "repeatability (σ)", "95 % interval", "pairs", "places", "variance to explain")
-    return Section("Repeatability: lower bound of model errors", text, header=header if rows else (), rows=rows)
+    return PageSection("Repeatability: lower bound of model errors", text, header=header if rows else (), rows=rows)

@@ -159,7 +159,7 @@ def _describe_witnesses(verdict: Verdict, label: Affected) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class PageSection:
     """A heading with a sentence, figures, controls and a table, each optional."""
 
     title: str
@@ -174,7 +174,7 @@ class Section:
     """Whether the table waits behind a line to click."""
     stacked: bool = False
     """Whether the figures are one below the other on wide pages too, as those with one axis are."""
-    parts: Sequence[Section] = ()
+    parts: Sequence[PageSection] = ()
     """Sections below it, which have no parts; those without figures wait behind their titles."""
 
     def list_number_columns(self) -> list[bool]:
@@ -187,7 +187,7 @@ def render_page(
     title: str,
     lead: str,
     numbers: Sequence[Number],
-    sections: Sequence[Section],
+    sections: Sequence[PageSection],
     verdict: VerdictBox | None = None,
     warnings: Sequence[str] = (),
     links: Sequence[Link] = (),

@@ -1,6 +1,6 @@
 """Interactive plots of pages: the only module that imports Bokeh.
 
-A page makes a plot, calls the glyph methods of ``plot.figure``, and hands it to a section (`tcpipe.report.page.Section`)::
+A page makes a plot, calls the glyph methods of ``plot.figure``, and hands it to a section (`tcpipe.report.page.PageSection`)::
 
     plot = new_plot("speed", alt="Speed over time", axes=("time [s]", "speed [m/s]"))
     plot.figure.line(time_s, speed_mps, color=KEPT)

@@ -293,7 +293,7 @@ _TRACK_LINES = (
 )
 
 
-def make_lines(series: Sequence[Series]) -> list[Line]:
+def make_trace_lines(series: Sequence[Series]) -> list[Line]:
     """Return the lines of these series, in the order of the page."""
     columns = {(part.name, column) for part in series for column in part.columns}
     lines = [line for line in _TRACK_LINES if (line.series, line.column) in columns]

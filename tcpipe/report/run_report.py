@@ -29,7 +29,16 @@ from tcpipe.report.label_sections import (
     make_quality_section,
 )
 from tcpipe.report.maps import RunMap, StoredMaps, draw_run_map
-from tcpipe.report.page import Column, Link, Number, Section, make_shown_column, pack_columns, render_page, show_verdict
+from tcpipe.report.page import (
+    Column,
+    Link,
+    Number,
+    PageSection,
+    make_shown_column,
+    pack_columns,
+    render_page,
+    show_verdict,
+)
 from tcpipe.report.run_plots import (
     SPEED_ROLES,
     FindingSpan,
@@ -37,11 +46,11 @@ from tcpipe.report.run_plots import (
     Timeline,
     find_finding_spans,
     find_mask_spans,
-    make_lines,
     make_rail_series,
     make_reasons_data,
     make_speed_series,
     make_timeline,
+    make_trace_lines,
     make_track_series,
     time_plots,
 )
@@ -97,7 +106,7 @@ def run_report(run: StoredRun, maps: StoredMaps, *, made_from: str = "") -> str:
 class _Drive:
     """Map and plots over time, and the data of their script; None of a run without a track."""
 
-    sections: list[Section]
+    sections: list[PageSection]
     data: Json
     is_complete: bool
     """Whether all maps and streams could be read."""
@@ -111,14 +120,14 @@ def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
 def _draw_run(run: StoredRun, track: pa.Table, segments: pa.Table, *, rejections: pa.Table, maps: StoredMaps) -> _Drive:
     if not track.num_rows:
         text = "No track: the log has no measurements that can be fused."
-        return _Drive([Section("The drive", text)], None, is_complete=True)
+        return _Drive([PageSection("The drive", text)], None, is_complete=True)
     info = run.manifest.info
     timeline = make_timeline(track)
     has_datum = info.datum is not None
     run_map = draw_run_map(run, track, segments, maps, has_datum=has_datum)
     sensor_series, lost = _read_series(run, timeline)
     series = [make_track_series(track, timeline, run_map.track_xy_m), *sensor_series]
-    lines, spans = make_lines(series), find_mask_spans(track, timeline, info.rate_hz)
+    lines, spans = make_trace_lines(series), find_mask_spans(track, timeline, info.rate_hz)
     findings = find_finding_spans(info.report.findings, track, timeline)
     over_time, lines_json = time_plots(
         timeline,
@@ -156,10 +165,10 @@ def _draw_run(run: StoredRun, track: pa.Table, segments: pa.Table, *, rejections
     text = "Click on the track or a plot for details."
     over = [_OVER_TIME, *([] if any(line.plot == "power" for line in lines) else ["There is no power."]), *lost]
     first, *others = over_time
-    drive = Section(
+    drive = PageSection(
         "The drive", " ".join([text, *run_map.missing]), controls="run.html", plots=[run_map.plot, first], stacked=True
     )
-    over_time_section = Section("Over time", " ".join(over), controls="run_time.html", plots=others, stacked=True)
+    over_time_section = PageSection("Over time", " ".join(over), controls="run_time.html", plots=others, stacked=True)
     return _Drive([drive, over_time_section], data, is_complete=run_map.is_complete and not lost)
 
 
@@ -227,7 +236,7 @@ def _find_severities(
     return worst
 
 
-def _make_label_sections(run: StoredRun, segments: pa.Table, physics: PhysicsFacts | None) -> list[Section]:
+def _make_label_sections(run: StoredRun, segments: pa.Table, physics: PhysicsFacts | None) -> list[PageSection]:
     """Return the section on labels, with physics, flags and uncertainty below it; none of a run without segments."""
     if not segments.num_rows:
         return []
@@ -237,17 +246,17 @@ def _make_label_sections(run: StoredRun, segments: pa.Table, physics: PhysicsFac
         make_quality_section(to_integers(segments, "quality"), "segments"),
         *make_budget_sections(run.facts.energy_budget),
     ]
-    return [Section("Labels", "One value per segment.", parts=parts)]
+    return [PageSection("Labels", "One value per segment.", parts=parts)]
 
 
-def _make_sensor_section(manifest: Run, rejections: pa.Table) -> Section:
+def _make_sensor_section(manifest: Run, rejections: pa.Table) -> PageSection:
     """Return the section on topics, rejections and clocks."""
     facts = manifest.info.report.facts
     parts = [_make_topics_section(manifest), *_make_trust_sections(facts, rejections), *_make_clock_sections(facts)]
-    return Section("Sensors", parts=parts)
+    return PageSection("Sensors", parts=parts)
 
 
-def _make_topics_section(manifest: Run) -> Section:
+def _make_topics_section(manifest: Run) -> PageSection:
     rows = [
         (
             *(role.replace("_", " "), sensor.topic, sensor.type_name, manifest.counts.messages.get(role, 0)),
@@ -256,10 +265,10 @@ def _make_topics_section(manifest: Run) -> Section:
         for role, sensor in sorted(manifest.sensors.items())
     ]
     header = ("role", "topic", "type", "messages", "stamp", "placed by", "why this topic")
-    return Section("Topics and roles", header=header, rows=rows)
+    return PageSection("Topics and roles", header=header, rows=rows)
 
 
-def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Section]:
+def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[PageSection]:
     """Return how many measurements each sensor gave, how many were refused and why, and how well the rest fitted."""
     counts, nis = (facts.fuse.measurements, facts.fuse.nis_mean) if facts.fuse else ({}, {})
     lost = Counter(zip(rejections.column("role").to_pylist(), rejections.column("reason").to_pylist(), strict=True))
@@ -282,10 +291,10 @@ def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Sectio
         "far below, too large."
     )
     header = ("sensor", "measurements", "rejected", "NIS", "excluded because")
-    return [Section("Rejected measurements by sensor", text, header=header, rows=rows)]
+    return [PageSection("Rejected measurements by sensor", text, header=header, rows=rows)]
 
 
-def _make_clock_sections(facts: StageFacts) -> list[Section]:
+def _make_clock_sections(facts: StageFacts) -> list[PageSection]:
     """Return the time offset of each sensor, if any could be compared."""
     steps = [f"{step.step_s:+.3f} s at log time {step.log_time_ns} ns" for step in facts.clock_steps]
     rows = [
@@ -304,10 +313,10 @@ def _make_clock_sections(facts: StageFacts) -> list[Section]:
     if steps:
         text += f" The clock steps: {'; '.join(steps)}."
     header = ("sensor", "relative to", "late by", "± (2σ)")
-    return [Section("Clocks", text.strip(), header=header, rows=rows)]
+    return [PageSection("Clocks", text.strip(), header=header, rows=rows)]
 
 
-def _make_provenance_section(manifest: Run) -> Section:
+def _make_provenance_section(manifest: Run) -> PageSection:
     """Return the inputs from which the run can be made again, and what is damaged of them."""
     rows = [
         ("made by", f"tcpipe {manifest.tcpipe_version}, data model {manifest.data_model_version}"),
@@ -318,4 +327,4 @@ def _make_provenance_section(manifest: Run) -> Section:
         *(("damage of the log", describe_finding(finding)) for finding in manifest.damage),
     ]
     text = "The same log and recipe give the same run."
-    return Section("Provenance", text, header=("what", "is"), rows=rows, folded=True)
+    return PageSection("Provenance", text, header=("what", "is"), rows=rows, folded=True)

@@ -18,7 +18,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.runs import RunFacts
 from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.report.label_sections import make_losses_sections
-from tcpipe.report.page import Link, Number, Section, render_page, show_verdict
+from tcpipe.report.page import Link, Number, PageSection, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
 from tcpipe.tables.findings import Finding, Verdict, select_problems
 from tcpipe.tables.levels import DATA_MODEL_VERSION
@@ -182,7 +182,7 @@ def store_report(store: StoreFacts, tracks: Plot | None = None) -> str:
         numbers=_make_numbers(store, current),
         warnings=[] if current else [problem],
         sections=[
-            *([Section("Tracks", plots=[tracks]), *table] if tracks else []),
+            *([PageSection("Tracks", plots=[tracks]), *table] if tracks else []),
             *(drift or losses),
             *([] if tracks else table),
             *(losses if drift else []),
@@ -209,7 +209,7 @@ def _make_numbers(store: StoreFacts, current: Sequence[RunRow]) -> list[Number]:
     ]
 
 
-def _make_table_section(store: StoreFacts, runs: Sequence[RunRow]) -> list[Section]:
+def _make_table_section(store: StoreFacts, runs: Sequence[RunRow]) -> list[PageSection]:
     if not runs:
         return []
     names = name_datasets(store.datasets)
@@ -228,10 +228,10 @@ def _make_table_section(store: StoreFacts, runs: Sequence[RunRow]) -> list[Secti
     text = "Click a column head to sort; a selection in the plots filters the table."
     if len(runs) > MOST_ROWS:
         text += f" Without scripts the table shows the first {MOST_ROWS} of {len(runs)}."
-    return [Section("All runs", text, header=_COLUMNS, rows=rows, controls="store.html")]
+    return [PageSection("All runs", text, header=_COLUMNS, rows=rows, controls="store.html")]
 
 
-def _make_drift_sections(runs: Sequence[RunRow]) -> list[Section]:
+def _make_drift_sections(runs: Sequence[RunRow]) -> list[PageSection]:
     """Return the plots over time; the page's script fills them."""
     dated = [run for run in runs if run.facts.start_ns is not None]
     is_known = {
@@ -273,7 +273,7 @@ def _make_drift_sections(runs: Sequence[RunRow]) -> list[Section]:
         source = points.data_source
         plots.append(plot)
     text = "Each point is a run. A box drawn here selects runs in the table; the filters of the table apply here."
-    return [Section("Trends over time", text, plots=plots, controls="store-drift.html" if "term" in names else "")]
+    return [PageSection("Trends over time", text, plots=plots, controls="store-drift.html" if "term" in names else "")]
 
 
 def _list_robots(runs: Sequence[RunRow]) -> list[tuple[str, str]]:
@@ -282,7 +282,7 @@ def _list_robots(runs: Sequence[RunRow]) -> list[tuple[str, str]]:
     return [(robot, CLASS_COLOURS[n % len(CLASS_COLOURS)]) for n, (robot, _) in enumerate(counts.most_common())]
 
 
-def _make_datasets_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[Section]:
+def _make_datasets_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[PageSection]:
     current_runs = {(run.facts.run_id, run.facts.recipe_id) for run in runs if run.is_current}
     rows = [
         (
@@ -294,10 +294,12 @@ def _make_datasets_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[S
         for dataset in store.datasets[-_MOST_LISTED:]
     ]
     header = ("dataset", "runs in it", "runs not in it", "")
-    return [Section("Datasets", "Datasets that were built from this store.", header=header, rows=rows)] if rows else []
+    return (
+        [PageSection("Datasets", "Datasets that were built from this store.", header=header, rows=rows)] if rows else []
+    )
 
 
-def _make_problem_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[Section]:
+def _make_problem_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[PageSection]:
     """Return the logs without a run, the runs that are damaged or cannot be read, and damaged documents."""
     rows = [(log.log, log.state, log.why) for log in store.failed]
     rows += [(document, "damaged", "its bytes have changed since it was written") for document in store.damaged]
@@ -314,7 +316,9 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[Se
     if len(rows) > _MOST_LISTED:
         text += f" The first {_MOST_LISTED} of {len(rows)}; the table above has every run."
     header = ("log or run", "is", "why")
-    return [Section("Failed, damaged and empty", text, header=header, rows=rows[:_MOST_LISTED], folded=len(rows) > 20)]
+    return [
+        PageSection("Failed, damaged and empty", text, header=header, rows=rows[:_MOST_LISTED], folded=len(rows) > 20)
+    ]
 
 
 def _make_data(store: StoreFacts, runs: Sequence[RunRow]) -> Json:

@@ -11,7 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.simulation.sensors import Command, Doppler, Gnss, Imu, Power, Reading, Sensors, Values, Visual, Wheels
+from tcpipe.simulation.sensors import (
+    Doppler,
+    Gnss,
+    Imu,
+    Joystick,
+    Power,
+    Reading,
+    Sensors,
+    Values,
+    Visual,
+    WheelOdometry,
+)
 
 Dialect = Literal["ros1", "ros2"]
 PowerType = Literal["husky_status", "clearpath_power"]
@@ -100,7 +111,7 @@ def _make_imu(topic: str, reading: Reading, sensor: Imu) -> MessageStream:
     )  # fmt: skip
 
 
-def _make_wheels(topic: str, reading: Reading, sensor: Wheels) -> MessageStream:
+def _make_wheels(topic: str, reading: Reading, sensor: WheelOdometry) -> MessageStream:
     values = reading.values
     columns = {"twist.twist.linear.x": values["velocity_mps"], "twist.twist.angular.z": values["yaw_rate_radps"]}
     columns |= {"pose.pose.position.x": values["x_m"], "pose.pose.position.y": values["y_m"]}
@@ -146,7 +157,7 @@ def _make_clearpath_power(topic: str, reading: Reading, _: Power) -> MessageStre
     return _make_stream(topic, kind, reading, "base_link", columns, battery_connected=1)
 
 
-def _make_command(topic: str, reading: Reading, _: Command, *, is_stamped: bool) -> MessageStream:
+def _make_command(topic: str, reading: Reading, _: Joystick, *, is_stamped: bool) -> MessageStream:
     columns = {"linear.x": reading.values["velocity_mps"], "angular.z": reading.values["yaw_rate_radps"]}
     if not is_stamped:
         return MessageStream(topic, "geometry_msgs/msg/Twist", reading.log_time_ns, columns)

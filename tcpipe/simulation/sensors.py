@@ -136,7 +136,7 @@ class Doppler:
 
 
 @dataclass(frozen=True, slots=True)
-class Wheels:
+class WheelOdometry:
     """Wheel odometry; its pose is its own dead reckoning."""
 
     rate_hz: float = 50.0
@@ -204,7 +204,7 @@ class Power:
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class Joystick:
     """The operator's joystick."""
 
     rate_hz: float = 20.0
@@ -217,11 +217,11 @@ class Sensors:
     """The whole set; None leaves a sensor out."""
 
     gnss: Gnss | None = field(default_factory=Gnss)
-    wheels: Wheels | None = field(default_factory=Wheels)
+    wheels: WheelOdometry | None = field(default_factory=WheelOdometry)
     imu: Imu | None = field(default_factory=Imu)
     visual: Visual | None = field(default_factory=Visual)
     power: Power | None = field(default_factory=Power)
-    command: Command | None = field(default_factory=Command)
+    command: Joystick | None = field(default_factory=Joystick)
     doppler: Doppler | None = None
 
     def mounted(self, faults: Faults) -> Sensors:
@@ -245,7 +245,7 @@ def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: No
     """Return what all sensors said of a drive, by sensor (gnss, imu, wheels, visual, power, command, doppler); ``sensors`` as mounted."""
     readers: dict[str, Callable[..., Reading]] = {
         "gnss": partial(read_gnss, site=site), "imu": read_imu, "wheels": read_wheels, "visual": read_visual,
-        "power": read_power, "command": read_command, "doppler": read_doppler,
+        "power": read_power_meters, "command": read_joystick, "doppler": read_doppler,
     }  # fmt: skip
     middle_ns = (int(truth.stamp_ns[0]) + int(truth.stamp_ns[-1])) // 2
     readings = {}
@@ -336,7 +336,7 @@ def read_doppler(truth: Truth, sensor: Doppler, faults: Faults, noise: Noise) ->
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="doppler")
 
 
-def read_wheels(truth: Truth, sensor: Wheels, faults: Faults, noise: Noise) -> Reading:
+def read_wheels(truth: Truth, sensor: WheelOdometry, faults: Faults, noise: Noise) -> Reading:
     """Return velocity_mps and yaw_rate_radps by the wheels, and their dead reckoning x_m, y_m, yaw_rad."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("wheels.phase"))
     at = truth.at(stamp)
@@ -414,7 +414,7 @@ def read_visual(truth: Truth, sensor: Visual, faults: Faults, noise: Noise) -> R
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="visual", keep=keep)
 
 
-def read_power(truth: Truth, sensor: Power, faults: Faults, noise: Noise) -> Reading:
+def read_power_meters(truth: Truth, sensor: Power, faults: Faults, noise: Noise) -> Reading:
     """Return voltage_volt, left_amp and right_amp (the drivers), electronics_amp (all else); drawn positive."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("power.phase"))
     read_ns = stamp if sensor.reading_hz is None else _sample_times(truth, sensor.reading_hz, noise("power.reading"))
@@ -439,7 +439,7 @@ def read_power(truth: Truth, sensor: Power, faults: Faults, noise: Noise) -> Rea
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="power", keep=keep)
 
 
-def read_command(truth: Truth, sensor: Command, faults: Faults, noise: Noise) -> Reading:
+def read_joystick(truth: Truth, sensor: Joystick, faults: Faults, noise: Noise) -> Reading:
     """Return velocity_mps and yaw_rate_radps as commanded."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("command.phase"))
     before = np.maximum(np.searchsorted(truth.stamp_ns, stamp, side="right") - 1, 0)

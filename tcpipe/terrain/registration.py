@@ -22,7 +22,7 @@ from tcpipe.arrays import Floats
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.sampling_kernel import compute_morton
-from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_window
+from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_tile_window
 
 Rows = NDArray[np.int64]
 
@@ -191,7 +191,7 @@ def _sample_heights(level: MapReader, xy_m: Floats) -> Floats:
     for group in group_by_tile(px, level):
         first, last = (np.floor(ends).astype(int) for ends in (px[group].min(axis=0), px[group].max(axis=0) + 1.0))
         (col0, row0), (col1, row1) = first - reach_px, last + reach_px
-        window = read_window(level, "height", row0, row1, col0, col1).astype(np.float64)
+        window = read_tile_window(level, "height", row0, row1, col0, col1).astype(np.float64)
         x, y = px[group, 0, None] - col0 + offset_px, px[group, 1, None] - row0 - offset_px  # rows run south
         places = np.broadcast_arrays(y[:, :, None], x[:, None, :])
         found[group] = map_coordinates(window, places, order=1)

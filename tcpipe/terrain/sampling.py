@@ -26,7 +26,7 @@ from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M, STACKS, group_stacks
 from tcpipe.terrain.sampling_kernel import Ground, Stacks, sample_tiles
 from tcpipe.terrain.target_grid import MapGrid
-from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_tile, read_window
+from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_tile, read_tile_window
 
 
 def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
@@ -167,7 +167,7 @@ def find_classes_at(source: MapReader, xy_m: NDArray[np.float64]) -> NDArray[np.
         col, row = np.floor(px[group] + 0.5).astype(np.int64).T
         col, row = np.clip(col, 0, source.grid.cols - 1), np.clip(row, 0, source.grid.rows - 1)
         top, left = int(row.min()), int(col.min())
-        window = read_window(source, "terrain", top, int(row.max()) + 1, left, int(col.max()) + 1)
+        window = read_tile_window(source, "terrain", top, int(row.max()) + 1, left, int(col.max()) + 1)
         found[on[group]] = window[row - top, col - left]
     return found
 

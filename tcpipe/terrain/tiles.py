@@ -92,7 +92,7 @@ def group_by_tile(px: NDArray[np.float64], source: MapReader) -> Iterator[NDArra
     yield from (group for group in np.split(order, np.flatnonzero(changed) + 1) if group.size)
 
 
-def read_window(  # noqa: PLR0917
+def read_tile_window(  # noqa: PLR0917
     source: MapReader, layer: str, row0: int, row1: int, col0: int, col1: int
 ) -> NDArray[Any]:
     """Return a window of a layer that may reach beyond the map, where it has no data."""

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from graphlib import TopologicalSorter
+from itertools import pairwise
 from pathlib import Path
 
 import grimp
@@ -251,6 +252,39 @@ def test_everything_public_is_explained():
             if named and not overloaded and not node.name.startswith("_") and ast.get_docstring(node) is None:
                 silent.append(f"{path}:{node.lineno} {node.name}")
     assert not silent
+
+
+def test_no_class_or_function_is_public_in_two_modules():
+    """Commands and functions of the API have the names of the functions that they call."""
+    modules: dict[str, set[str]] = {}
+    for path, tree in read_trees().items():
+        for node in tree.body:
+            named = isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_")
+            if named and not path.startswith(("cli/", "api.py")):
+                modules.setdefault(node.name, set()).add(path)
+    assert {name: paths for name, paths in modules.items() if len(paths) > 1} == {}
+
+
+def list_stray_docstrings(nodes: list[ast.AST]) -> Iterator[int]:
+    """Yield the line of each docstring that neither begins a module, class or function nor follows an assignment."""
+    for node in nodes:
+        body = getattr(node, "body", None)
+        for before, statement in pairwise([node, *body] if isinstance(body, list) else []):
+            match statement, before:
+                case ast.Expr(value=ast.Constant(value=str())), ast.Assign() | ast.AnnAssign() | ast.AugAssign():
+                    pass
+                case ast.Expr(value=ast.Constant(value=str())), ast.Module() | ast.ClassDef() | ast.FunctionDef() if (
+                    before is node
+                ):
+                    pass
+                case ast.Expr(value=ast.Constant(value=str())), _:
+                    yield statement.lineno
+
+
+def test_every_docstring_belongs_to_a_name():
+    assert {path: lines for path, nodes in read_nodes().items() if (lines := [*list_stray_docstrings(nodes)])} == {}
+    source = '"""Module."""\nA = 1\n"""Quantity A."""\n"""Stray."""\nif A:\n    """Stray, too."""\n'
+    assert [*list_stray_docstrings([*ast.walk(ast.parse(source))])] == [4, 6]
 
 
 def test_help_imports_nothing_heavy():

@@ -13,7 +13,7 @@ from tcpipe.robots import Robot
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario, make_tiny, read_truth, simulate
 from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.robot import SimulatedRobot
-from tcpipe.simulation.sensors import Imu, Wheels
+from tcpipe.simulation.sensors import Imu, WheelOdometry
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.mask import mask_track
@@ -165,7 +165,7 @@ def test_turns_attitude_slip_and_vibration_are_the_robots(faulty):
     arc = np.interp(end_ns, truth.stamp_ns, truth.distance_m) - np.interp(start_ns, truth.stamp_ns, truth.distance_m)
     turn_rate = meant(truth, np.abs(truth.angular_velocity_radps[:, 2]), labelled)
     wheel_mps = meant(truth, truth.wheel_velocity_mps, labelled)
-    slip = 1 - meant(truth, truth.forward_velocity_mps, labelled) / (Wheels().scale * wheel_mps)
+    slip = 1 - meant(truth, truth.forward_velocity_mps, labelled) / (WheelOdometry().scale * wheel_mps)
     for name, wanted in (
         ("yaw_change_rad", turn),
         ("mean_abs_yaw_rate_radps", turn_rate),

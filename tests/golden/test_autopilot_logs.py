@@ -19,7 +19,7 @@ from storage_server import object_store
 
 import tcpipe
 from tcpipe.errors import RoleError
-from tcpipe.formats.logs.autopilot_log import read_records
+from tcpipe.formats.logs.autopilot_log import read_autopilot_records
 from tcpipe.logs.topics import split_notes
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import ReadConfig, Recipe
@@ -66,7 +66,7 @@ def read_by_pymavlink(path):
 
 
 def assert_same_columns(path, kind, theirs):
-    records = read_records(path, kind)
+    records = read_autopilot_records(path, kind)
     for name, of in records.messages.items():
         for field, values in of.read_columns(records.data).items():
             parts = {field: values} if values.ndim == 1 else {f"{field}[{i}]": v for i, v in enumerate(values.T)}

@@ -9,14 +9,14 @@ from autopilot_files import Drive, write_dataflash, write_ulog
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tcpipe.formats.logs.autopilot_log import read_records
+from tcpipe.formats.logs.autopilot_log import read_autopilot_records
 
 WRITERS = {"ulog": write_ulog, "dataflash": write_dataflash}
 
 
 def read(path, kind):
     """Return the count of every message of a log, and whether a loss is reported."""
-    records = read_records(path, kind)
+    records = read_autopilot_records(path, kind)
     rows = Counter()
     for name, of in records.messages.items():
         columns = of.read_columns(records.data).values()

@@ -165,7 +165,7 @@ def _find_stray(time_us: Ints) -> NDArray[np.bool_]:
     return is_stray
 
 
-def read_records(path: Path, kind: AutopilotKind) -> AutopilotRecords:
+def read_autopilot_records(path: Path, kind: AutopilotKind) -> AutopilotRecords:
     """Return what a ``ulog`` or ``dataflash`` log holds; `LogError` where it cannot be read, or was made to take all memory."""
     try:
         records = AutopilotRecords(path, path.read_bytes())
@@ -443,7 +443,7 @@ _OWN_PACKAGES = {"ulog": "px4", "dataflash": "ardupilot"}
 
 def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> TableLog:
     """Read a ``ulog`` or ``dataflash`` log; ``stack`` is closed with it. `LogError`: it cannot be read."""
-    records = read_records(path, kind)
+    records = read_autopilot_records(path, kind)
     known = {name: message for name, message in records.messages.items() if _find_base(name) in CONVERTED}
     messages = {
         name: (message.time_us, select_fields(message.read_columns(records.data))) for name, message in known.items()

@@ -68,7 +68,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
     if problems:
         return problems
     try:
-        names = read_column_names(path)
+        names = read_table_header(path)
         stamp = names[0] if mapping.stamp is None else mapping.stamp
         fields = read_fields(f"{where}.columns", role, mapping.columns, mapping.units, names)
         problems = [f"{problem} ({mapping.file})" for problem in fields] if isinstance(fields, list) else []
@@ -80,7 +80,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
         if isinstance(fields, list) or problems:
             return problems
         of_stamps = (stamp, mapping.stamp_utc, mapping.stamp_date)
-        cells, values = read_values(path, [column for column in of_stamps if column and column in names], fields)
+        cells, values = read_column_values(path, [column for column in of_stamps if column and column in names], fields)
     except LogError as error:
         return [problem.removeprefix(f"{folder}/") for problem in error.problems]
     empty = [
@@ -187,7 +187,7 @@ def _report_unreadable(path: Path) -> Iterator[None]:
         raise LogError(f"{path}: it cannot be read as a table ({str(error).splitlines()[0]})") from None
 
 
-def read_column_names(path: Path) -> list[str]:
+def read_table_header(path: Path) -> list[str]:
     """Return what the columns of a table are called; `LogError` where it cannot be read."""
     with _report_unreadable(path):
         return _scan(path).collect_schema().names()
@@ -225,7 +225,7 @@ def read_numbers(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float
     return {name: of.fill_null(np.nan).to_numpy() for name, of in numbers.items() if of.null_count() < len(of)}
 
 
-def read_values(
+def read_column_values(
     path: Path, stamps: Sequence[str], fields: Mapping[str, FieldSource]
 ) -> tuple[Cells, dict[str, NDArray[np.float64]]]:
     """Return the cells that fields are made of, and the fields' values, shape (rows,)."""

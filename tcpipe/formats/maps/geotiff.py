@@ -170,7 +170,7 @@ def read_window(  # noqa: PLR0917
     except RasterioError as error:
         raise MapError(
             f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: "
-            f"{describe_error(error)}"
+            f"{describe_raster_error(error)}"
         ) from error
     valid = mask >= _OPAQUE
     if tile.use == "classes" and raw.dtype.kind == "f":
@@ -344,11 +344,11 @@ def _open(path: Path, driver: str) -> Any:
             return rasterio.open(path.absolute(), driver=driver)  # from the root on: no GDAL prefix, no address
         except RasterioError as error:
             raise MapError(
-                f"{path}: not a raster that GDAL can read; the file is damaged: {describe_error(error)}"
+                f"{path}: not a raster that GDAL can read; the file is damaged: {describe_raster_error(error)}"
             ) from error
 
 
-def describe_error(error: BaseException) -> str:
+def describe_raster_error(error: BaseException) -> str:
     """Return the first line of what GDAL says."""
     return str(error.__cause__ or error).splitlines()[0][:200]
 
@@ -519,7 +519,7 @@ def _convert_late_errors() -> Iterator[None]:
         yield
     except Exception as error:
         raise OSError(
-            f"GDAL could not finish the file (often: No space left on device): {describe_error(error)}"
+            f"GDAL could not finish the file (often: No space left on device): {describe_raster_error(error)}"
         ) from error
 
 
@@ -562,4 +562,4 @@ def read_bands(path: Path, bands: Sequence[int]) -> NDArray[Any]:
             dataset = open_file(path, _list_plain_files(path)[0])
             return np.asarray(dataset.read(list(bands)))
     except RasterioError as error:
-        raise MapError(f"{path}: cannot be read; the file is damaged ({describe_error(error)})") from error
+        raise MapError(f"{path}: cannot be read; the file is damaged ({describe_raster_error(error)})") from error

@@ -208,13 +208,13 @@ def fit_physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
         rows = np.flatnonzero(pc.equal(samples.column("robot"), robot).to_numpy())
         rows = rows[np.argsort(start_ns[rows], kind="stable")]
         mine = samples.select(_FITTED).take(pa.array(rows[:: -(-rows.size // _MOST_FITTED)]))
-        fit = fit_and_validate_physics(make_fit_samples(mine), idle_watt=find_idle_power(mine))
+        fit = fit_and_validate_physics(make_fit_samples(mine), idle_watt=compute_mean_idle_power(mine))
         if fit is not None:
             found[robot] = fit
     return found
 
 
-def find_idle_power(samples: pa.Table) -> float | None:
+def compute_mean_idle_power(samples: pa.Table) -> float | None:
     """Return the idle power [W], the mean over the samples; None if no run was stationary."""
     watt = to_floats(samples, "idle_power_watt")
     return float(np.nanmean(watt)) if np.isfinite(watt).any() else None

@@ -23,7 +23,7 @@ from tcpipe.pipeline.log_sources import find_damaged_log
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import TO_DO, IngestResult, check_age, make_result
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.status import find_status
+from tcpipe.pipeline.status import find_log_states
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store, name_run, open_store
 from tcpipe.tables.findings import Subject, make_finding
@@ -120,7 +120,9 @@ def test_what_status_predicts_is_what_ingest_does(row, actions):
 def compare(logs, store, worked, **how):
     predicted = {
         name: group.state
-        for group in find_status(IngestOptions([logs], store=store, **{"min_age": 600.0, **how}), create=True).groups
+        for group in find_log_states(
+            IngestOptions([logs], store=store, **{"min_age": 600.0, **how}), create=True
+        ).groups
         for name in group.logs
     }
     before, worked[:] = Store(store).scan(), []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from adapted_drives import compare_adaptations
 
-from tcpipe.cost.adaptation import Metres, Run, adapt
+from tcpipe.cost.adaptation import MeasuredRun, Metres, adapt
 from tcpipe.cost.prediction_errors import fit_errors
 
 
@@ -42,7 +42,7 @@ CHANGES = {"same": {}, "heavier": {"payload": 0.4}, "another robot": {"scale": 1
 def test_an_adapted_model_is_better_and_its_intervals_cover(change):
     """At least 90 % of metres and of sums after 50 m, less the chance of 60 runs; the error falls to that of the noise."""
     rng, errors = np.random.default_rng(1), made_errors()
-    runs = [Run(str(number), {"energy": made_run(rng, **change)}) for number in range(60)]
+    runs = [MeasuredRun(str(number), {"energy": made_run(rng, **change)}) for number in range(60)]
     found = {of.metres: of for of in compare_adaptations({"energy": errors}, runs, (0, 5, 10, 50))}
     plain, few, much = found[0], found[5], found[50]
     assert {(of.runs, of.samples) for of in found.values()} == {(60, 60 * 250)}
@@ -79,5 +79,5 @@ def test_one_metre_hardly_moves_the_model():
 
 
 def test_runs_that_are_too_short_are_in_no_row():
-    run = Run("short", {"energy": made_run(np.random.default_rng(5), 55)})
+    run = MeasuredRun("short", {"energy": made_run(np.random.default_rng(5), 55)})
     assert list(compare_adaptations({"energy": made_errors()}, [run], (0, 50))) == []

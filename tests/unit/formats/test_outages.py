@@ -10,7 +10,7 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.place import Place, open_place
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.status import find_status
+from tcpipe.pipeline.status import find_log_states
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 
@@ -90,7 +90,7 @@ def _ingest(logs):
 def _finish(logs):
     """Expect that the next call makes up for the log that failed, and that nothing is left to do."""
     assert {name: of.status for name, of in _ingest(logs).items()} == {"one": "done", "two": "unchanged"}
-    assert find_status(IngestOptions([logs], store="s3://tests/store", recipe=Recipe(), min_age=0.0)).counts == {
+    assert find_log_states(IngestOptions([logs], store="s3://tests/store", recipe=Recipe(), min_age=0.0)).counts == {
         "done": 2
     }
     left = verify("s3://tests/store").problems

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.table_log import read_cells, read_column_names
+from tcpipe.formats.logs.table_log import read_cells, read_table_header
 from tcpipe.formats.logs.table_stamps import choose_clock, read_clock
 
 
@@ -29,7 +29,7 @@ def ns(*time):
 def test_a_table_is_told_by_its_first_lines(tmp_path, text, names, stamps, values):
     path = tmp_path / "table.csv"
     path.write_text(text)
-    assert read_column_names(path) == names
+    assert read_table_header(path) == names
     found = read_cells(path, stamps=[names[0]], columns=[names[1]])
     assert found.stamps[names[0]].to_list() == stamps
     np.testing.assert_array_equal(found.columns[names[1]], values)
@@ -40,12 +40,12 @@ def test_a_table_is_told_by_its_first_lines(tmp_path, text, names, stamps, value
 def test_a_tum_trajectory_and_a_solution_of_rtklib(tmp_path):
     tum, pos = tmp_path / "gt.txt", tmp_path / "ppk.pos"
     tum.write_text("1760456485.7 1 2 3 0 0 0 1\n1760456485.8 4 5 6 0 0 0 1\n")
-    assert read_column_names(tum) == ["timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
+    assert read_table_header(tum) == ["timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
     pos.write_text(
         "% program   : RTKLIB\n%\n%  GPST                 latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)\n"
         "2025/10/14 15:41:25.700   47.1234567890  -71.1   643.6   1  12   0.0100\n"
     )
-    assert read_column_names(pos)[:2] == ["GPST", "latitude(deg)"]
+    assert read_table_header(pos)[:2] == ["GPST", "latitude(deg)"]
     found = read_cells(pos, stamps=["GPST"], columns=["latitude(deg)", "sdn(m)"])
     clock = read_clock(found.stamps["GPST"])
     assert (clock.kind, clock.ns.to_list()) == ("utc", [ns(2025, 10, 14, 15, 41, 25) - 17_300_000_000])

@@ -9,7 +9,7 @@ from unit.fusion import se3_reference as reference
 
 from tcpipe.fusion import error_state, smoother_kernel, state
 from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
-from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Inputs, Memory, allocate_steps, filter_ticks
+from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Memory, TickInputs, allocate_steps, filter_ticks
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
 from tcpipe.fusion.smoother_kernel import (
@@ -59,7 +59,7 @@ def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
             ((rng.normal(size=3) + reference.G) * T, (rng.normal(size=3) + reference.G) * T**2 / 2)
         )
     shape = count, state.KINDS
-    return Inputs(
+    return TickInputs(
         T,
         np.full(count, mode, np.int8),
         turned,

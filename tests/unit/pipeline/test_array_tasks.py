@@ -11,7 +11,7 @@ from object_gateway import open_bucket
 from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.log_sources import find_sources, select_shard
+from tcpipe.pipeline.log_sources import list_log_sources, select_shard
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
@@ -61,7 +61,7 @@ def root(request, tmp_path, monkeypatch):
 
 def test_one_call_after_an_array_ingests_what_its_killed_tasks_left(root, drives, tmp_path):
     (marks := tmp_path / "marks").mkdir()
-    sources = find_sources([drives], as_one=False, staging=tmp_path).sources
+    sources = list_log_sources([drives], as_one=False, staging=tmp_path).sources
     own = {share: [sources[at].stem for at in select_shard(sources, (share, 4))] for share in range(1, 5)}
     deadly = {share: own[share][-1] for share in sorted(own, key=lambda share: len(own[share]))[-2:]}
     running = []

@@ -16,7 +16,7 @@ from tcpipe.pipeline.ingest import ingest, run_ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.status import find_status
+from tcpipe.pipeline.status import find_log_states
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import LabelConfig, Recipe
 from tcpipe.store import Store
@@ -299,7 +299,7 @@ def test_a_night_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, se
     store, logs, counts = "s3://tests/store", tmp_path / "logs", {"new log": [], "nothing new": [], "status": []}
     for number in range(4):
         drive_at(logs / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
-        calls = {"new log": run_ingest, "nothing new": run_ingest, "status": find_status}
+        calls = {"new log": run_ingest, "nothing new": run_ingest, "status": find_log_states}
         for what, call in calls.items():
             documents._DECODED.clear()  # as another process
             before, served.requests = len(served), 0

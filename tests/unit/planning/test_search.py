@@ -23,7 +23,7 @@ from tcpipe.planning.path_cost import compute_path_cost
 from tcpipe.planning.plan import plan_path
 from tcpipe.planning.search import (
     Turning,
-    compute_turns,
+    compute_course_changes,
     find_best_potential,
     find_least_cost_paths,
     find_turning,
@@ -257,7 +257,7 @@ def test_a_circle_turns_once_round_however_fine_it_is_cut():
     for count in (24, 200):
         angle = np.linspace(0.0, 2.0 * np.pi, count + 1)
         points = np.column_stack([np.cos(angle), np.sin(angle)])
-        turned = compute_turns(points[:-1], points[1:]).sum()
+        turned = compute_course_changes(points[:-1], points[1:]).sum()
         assert turned == pytest.approx(2.0 * np.pi * (1.0 - 1.0 / count))
 
 

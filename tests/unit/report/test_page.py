@@ -6,7 +6,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 from tcpipe.formats.finding_lines import group_findings
-from tcpipe.report.page import Link, Number, Section, Shaded, render_page, show_verdict
+from tcpipe.report.page import Link, Number, PageSection, Shaded, render_page, show_verdict
 from tcpipe.report.plots import draw_waterfall, make_plot, render_plots
 from tcpipe.tables.findings import Remedy, Subject, judge, make_finding, read_catalogue
 
@@ -51,8 +51,8 @@ def page():
         verdict=show_verdict(judge([evil]), [evil]),
         links=[Link(EVIL, EVIL), Link("plain", "javascript:alert(1)")],
         sections=[
-            Section(EVIL, EVIL, header=(EVIL,), rows=[(EVIL,), (Link(EVIL, "a/b"),), (Shaded(EVIL, 2.0),)]),
-            Section("drawn", plots=drawn()),
+            PageSection(EVIL, EVIL, header=(EVIL,), rows=[(EVIL,), (Link(EVIL, "a/b"),), (Shaded(EVIL, 2.0),)]),
+            PageSection("drawn", plots=drawn()),
         ],
         data={EVIL: [EVIL, 1]},
     )
@@ -136,7 +136,7 @@ def test_only_columns_of_numbers_are_aligned_to_the_right():
         "87f31f5a": ["1", "2"],
         7: [1, 0],
     }
-    section = Section("s", rows=list(zip(*([first, *rest] for first, rest in columns.items()), strict=True)))
+    section = PageSection("s", rows=list(zip(*([first, *rest] for first, rest in columns.items()), strict=True)))
     right = [first for first, is_right in zip(columns, section.list_number_columns(), strict=True) if is_right]
     assert right == ["13", "3.8 %", "+12 ms", "0.81 (0.70 to 0.95)", "0.061 s, 3.4 %", 7]
 
@@ -150,8 +150,8 @@ def test_one_of_a_kind_is_called_so():
 def test_parts_without_figures_are_folded_and_long_texts_from_the_second_line():
     plot = make_plot("small", alt="small", axes=("x", "y"))
     plot.figure.line([0.0, 1.0], [0.0, 1.0])
-    parts = [Section("drawn", plots=[plot]), Section("listed", header=("a",), rows=[("cell",)])]
-    html = render_page(title="t", lead="", numbers=[], sections=[Section("s", "short\nlong", parts=parts)])
+    parts = [PageSection("drawn", plots=[plot]), PageSection("listed", header=("a",), rows=[("cell",)])]
+    html = render_page(title="t", lead="", numbers=[], sections=[PageSection("s", "short\nlong", parts=parts)])
     body = html.split('<section id="s1">')[1].split("</section>")[0]
     at_once = re.sub("<details.*?</details>", "", body, flags=re.DOTALL)
     assert "short" in at_once
@@ -193,7 +193,7 @@ def test_nothing_is_asked_of_the_network_and_bokeh_comes_with_figures_alone():
     html = page()
     assert "default-src 'none'" in html
     assert not [attrs for _, attrs in Seen(html).tags if {"src", "srcset", "data", "action"} & set(attrs)]
-    html = render_page(title="t", lead="", numbers=[], warnings=[], sections=[Section("s", "text")])
+    html = render_page(title="t", lead="", numbers=[], warnings=[], sections=[PageSection("s", "text")])
     assert len(html) < 24_000
 
 

@@ -11,7 +11,7 @@ from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at, make_patch_frames, map_px_from_patch, sample_patches
 from tcpipe.terrain.target_grid import MapGrid
-from tcpipe.terrain.tiles import CACHED_TILES, TilePool, group_by_tile, read_window
+from tcpipe.terrain.tiles import CACHED_TILES, TilePool, group_by_tile, read_tile_window
 
 
 def frames_at(grid, count, seed=1, margin_m=1.5, chord_m=1.0):
@@ -200,10 +200,10 @@ def test_positions_are_grouped_by_tile_once_each():
 
 def test_windows_beyond_the_map_have_no_data_there():
     source = random_map(rows=60, cols=50)
-    whole = read_window(source, "ortho", -5, 65, -7, 53)
+    whole = read_tile_window(source, "ortho", -5, 65, -7, 53)
     np.testing.assert_array_equal(whole[5:-5, 7:-3], source.arrays["ortho"])
     assert not whole[:5].any()
-    assert np.isnan(read_window(source, "height", 70, 75, 0, 5)).all()
+    assert np.isnan(read_tile_window(source, "height", 70, 75, 0, 5)).all()
 
 
 def test_good_patches_move_together():
