@@ -137,7 +137,7 @@ def test_a_file_of_others_that_the_new_dataset_would_replace_is_kept(here):
     path.parent.mkdir()
     path.write_text("mine")
     with pytest.raises(DatasetError, match="has the name of a file of the new dataset; rename it"):
-        build_dataset(here / "dataset", **usual(here, file_format="parquet", force=True))
+        build_dataset(here / "dataset", **usual(here, format="parquet", force=True))
     assert path.read_text() == "mine"
 
 
