@@ -15,9 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
-
-Stamps = NDArray[np.int64]
+from tcpipe.arrays import Floats, Ints
 
 LOW_HZ, HIGH_HZ = 3.0, 20.0
 LEAST_RATE_HZ = 2.5 * HIGH_HZ
@@ -34,7 +32,7 @@ _NS = 1e-9
 
 
 def compute_vibration_mps2(
-    stamp_ns: Stamps, specific_force_mps2: Floats, start_ns: Stamps, end_ns: Stamps
+    stamp_ns: Ints, specific_force_mps2: Floats, start_ns: Ints, end_ns: Ints
 ) -> tuple[Floats, Floats]:
     """Return the root mean square over each span of the band-passed specific force, and its standard deviation [m/s²], shape (M,) each.
 
@@ -93,7 +91,7 @@ def _filter_band(values: Floats, period_s: float) -> Floats:
     return passed
 
 
-def _is_without_gap(stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps, *, longest_s: float) -> NDArray[np.bool_]:
+def _is_without_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_s: float) -> NDArray[np.bool_]:
     """Return which spans have no gap in them or near them."""
     gaps = np.concatenate(([0], np.cumsum(np.diff(stamp_ns) * _NS > longest_s)))
     last, near_ns = len(stamp_ns) - 1, round(_RINGS_S / _NS)

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.power.rails import Rail, interpolate_rail
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
-
-Stamps = NDArray[np.int64]
 
 _WINDOW_S = 10.0
 """Slower changes of the voltage are those of its charge."""
@@ -36,7 +34,7 @@ _SETTLED_NS = 300_000_000
 _SHORTEST_HALT_NS = 1_000_000_000
 
 
-def measure_rest_currents(rail: Rail, still_ns: Stamps) -> Floats:
+def measure_rest_currents(rail: Rail, still_ns: Ints) -> Floats:
     """Return the mean current of a rail in each halt of a second or more [A]; ``still_ns``, shape (S, 2), begin and end [ns]."""
     settled = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
     settled = settled[settled[:, 1] - settled[:, 0] >= _SHORTEST_HALT_NS]
@@ -77,12 +75,12 @@ def estimate_offset_std(rest_amp: Floats, rest_range_amp: tuple[float, float] | 
 class Sag:
     """Changes of voltage [V] and current [A] within seconds, shape (N,), and of the current's neighbours, whose noise is another."""
 
-    stamp_ns: Stamps
+    stamp_ns: Ints
     volt: Floats
     amp: Floats
     neighbour_amp: Floats
 
-    def products(self, edge_ns: Stamps) -> tuple[Floats, Floats]:
+    def products(self, edge_ns: Ints) -> tuple[Floats, Floats]:
         """Return the sums of voltage and of current, times the current's neighbours, up to each time, shape (E,)."""
         at = np.searchsorted(self.stamp_ns, edge_ns)
         sums = (np.concatenate(([0.0], np.cumsum(values * self.neighbour_amp))) for values in (self.volt, self.amp))
@@ -163,7 +161,7 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     return GainChange(int(start_ns[first]), before / after)
 
 
-def _compare_halves(start_ns: Stamps, by_volt: Floats, weight: Floats) -> GainChange | None:
+def _compare_halves(start_ns: Ints, by_volt: Floats, weight: Floats) -> GainChange | None:
     """Return the gain of the second half of the blocks over the first; None where it is usual, or a half does not show the resistance."""
     middle = len(weight) // 2
     first_ohm, last_ohm = (_estimate_ohm(by_volt[half], weight[half]) for half in (slice(middle), slice(middle, None)))
@@ -178,7 +176,7 @@ def estimate_resistance_ohm(sag: Sag | None) -> float | None:
     return None if sag is None else _estimate_ohm(*_split_blocks(sag)[1:])
 
 
-def _split_blocks(sag: Sag) -> tuple[Stamps, Floats, Floats]:
+def _split_blocks(sag: Sag) -> tuple[Ints, Floats, Floats]:
     """Return the start of each block [ns], and its sums of voltage times current and of the current's square, shape (B,).
 
     Blocks start anew after a gap that is longer than a block.
@@ -201,7 +199,7 @@ def _estimate_ohm(by_volt: Floats, by_amp: Floats) -> float | None:
     return ohm if ohm > _CLEAR * std_ohm else None
 
 
-def find_lost_signs(sag: Sag | None, start_ns: Stamps, end_ns: Stamps, rise: Floats) -> NDArray[np.bool_]:
+def find_lost_signs(sag: Sag | None, start_ns: Ints, end_ns: Ints, rise: Floats) -> NDArray[np.bool_]:
     """Return the segments whose current flows back, but has no sign, shape (M,); none unless several downhill ones surely show it.
 
     There voltage and current rise together: the likelihoods of both signs are compared. ``rise`` is the tangent of the slope along travel.

@@ -17,13 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Mask
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.power.rails import Rail, SampledSignal, interpolate_rail, sum_power
 from tcpipe.power.sampling import estimate_smoothing_variance
 from tcpipe.robust import solve_non_negative
 from tcpipe.tables.facts import Smoothing
-
-Stamps = NDArray[np.int64]
 
 _NS = 1e-9
 
@@ -47,9 +45,9 @@ class EnergyNoise:
 
 def estimate_energy_noise(
     rails: list[Rail],
-    start_ns: Stamps,
-    end_ns: Stamps,
-    still_ns: Stamps,
+    start_ns: Ints,
+    end_ns: Ints,
+    still_ns: Ints,
     *,
     rate_hz: float | None = None,
     smoothing: Smoothing | None = None,
@@ -92,13 +90,13 @@ def estimate_resolution(signal: SampledSignal) -> float:
     return float(np.median(np.diff(levels))) if 1 < len(levels) < 0.5 * len(signal.value) else 0.0
 
 
-def _is_inside(at_ns: Stamps, start_ns: Stamps, end_ns: Stamps) -> Mask:
+def _is_inside(at_ns: Ints, start_ns: Ints, end_ns: Ints) -> Mask:
     """Return whether each time, shape (N,), is inside one of several spans, (M,)."""
     return np.asarray(np.searchsorted(start_ns, at_ns, side="right") > np.searchsorted(end_ns, at_ns, side="left"))
 
 
 def _estimate_integral_variance(
-    signal: SampledSignal, start_ns: Stamps, end_ns: Stamps, still_ns: Stamps, *, averaged: bool, rate_hz: float | None
+    signal: SampledSignal, start_ns: Ints, end_ns: Ints, still_ns: Ints, *, averaged: bool, rate_hz: float | None
 ) -> tuple[Floats, Floats]:
     """Return the variance of the signal's time integral over each span, in its unit squared times s², shape (M,).
 
@@ -140,7 +138,7 @@ def _sum_squared_shares(variance: Floats, edge_s: Floats, start_s: Floats, end_s
     return np.where(first < last, sums + divided, variance[first] * (end - begin) ** 2)
 
 
-def _estimate_rounding(signal: SampledSignal, start_ns: Stamps, end_ns: Stamps) -> Floats:
+def _estimate_rounding(signal: SampledSignal, start_ns: Ints, end_ns: Ints) -> Floats:
     """Return the variance of a signal that stays on one level of its resolution, shape (M,): all its samples have one error."""
     changes = np.append(0, np.cumsum(np.diff(signal.value) != 0))
     first, last = (changes[np.maximum(np.searchsorted(signal.stamp_ns, at) - 1, 0)] for at in (start_ns, end_ns))
@@ -218,7 +216,7 @@ def fit_signal_model(signal: SampledSignal, steady: Mask, still: Mask, *, averag
 
 
 def estimate_local_scale(
-    model: SignalModel, signal: SampledSignal, steady: Mask, start_ns: Stamps, end_ns: Stamps
+    model: SignalModel, signal: SampledSignal, steady: Mask, start_ns: Ints, end_ns: Ints
 ) -> Floats:
     """Return the ratio of the processes' variance near each span to that of the record, shape (M,).
 

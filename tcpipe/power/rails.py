@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from tcpipe.arrays import Floats, Ints
 from tcpipe.geometry.piecewise_linear import integrate_held_to, integrate_product_to, interpolate
 
-Stamps = NDArray[np.int64]
-
 _PERIODS = 3
 """Periods without a sample that are a gap, if the recipe allows less: single lost messages are no gap."""
 
@@ -35,7 +33,7 @@ _PERIODS = 3
 class SampledSignal:
     """One measured signal: stamps [ns], shape (N,), int64, strictly increasing, and values, shape (N,)."""
 
-    stamp_ns: Stamps
+    stamp_ns: Ints
     value: Floats
 
 
@@ -64,12 +62,12 @@ class Rail:
     voltage: SampledSignal
     current: SampledSignal
     averaged: bool
-    stamp_ns: Stamps
+    stamp_ns: Ints
     voltage_volt: Floats
     current_amp: Floats
 
 
-def make_samples(stamp_ns: Stamps, value: Floats) -> SampledSignal:
+def make_samples(stamp_ns: Ints, value: Floats) -> SampledSignal:
     """Return the finite values in time order; of several at one stamp the first given, as for every other sensor.
 
     Of means the second says nothing: no time lies between it and the first.
@@ -92,7 +90,7 @@ def make_rail(name: str, voltage: SampledSignal, current: SampledSignal, *, aver
     return Rail(name, voltage, current, averaged, union, volt, amp)
 
 
-def interpolate_value(signal: SampledSignal, at_ns: Stamps, *, averaged: bool) -> Floats:
+def interpolate_value(signal: SampledSignal, at_ns: Ints, *, averaged: bool) -> Floats:
     """Return a signal of at least one sample at each time, shape (M,), by the one rule; its ends are held beyond them."""
     if averaged:
         ends_at = np.searchsorted(signal.stamp_ns, at_ns, side="left")
@@ -100,7 +98,7 @@ def interpolate_value(signal: SampledSignal, at_ns: Stamps, *, averaged: bool) -
     return interpolate(signal.stamp_ns, signal.value, at_ns)
 
 
-def interpolate_rail(each: Rail, at_ns: Stamps) -> tuple[Floats, Floats]:
+def interpolate_rail(each: Rail, at_ns: Ints) -> tuple[Floats, Floats]:
     """Return voltage [V] and current [A] of a rail at each time, shape (M,), ends held; NaN if they are never both known."""
     if not len(each.stamp_ns):
         return np.full(len(at_ns), np.nan), np.full(len(at_ns), np.nan)
@@ -108,7 +106,7 @@ def interpolate_rail(each: Rail, at_ns: Stamps) -> tuple[Floats, Floats]:
     return interpolate_value(volt, at_ns, averaged=each.averaged), interpolate_value(amp, at_ns, averaged=each.averaged)
 
 
-def compute_power_watt(rails: list[Rail], at_ns: Stamps) -> Floats:
+def compute_power_watt(rails: list[Rail], at_ns: Ints) -> Floats:
     """Return the power of all rails at each time, [W], shape (M,), ends held; NaN without rails, or if a rail is never known."""
     total = np.full(len(at_ns), np.nan if not rails else 0.0)
     for each in rails:
@@ -125,7 +123,7 @@ def sum_power(rails: list[Rail]) -> SampledSignal | None:
     return SampledSignal(stamp_ns, compute_power_watt(rails, stamp_ns))
 
 
-def compute_power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tuple[Floats, Floats, Floats]:
+def compute_power_at(rails: list[Rail], at_ns: Ints, *, max_gap_ns: int) -> tuple[Floats, Floats, Floats]:
     """Return mean voltage [V], summed current [A] and summed power [W] at each stamp, each of shape (M,).
 
     NaN without rails, and where any rail's voltage or current has no sample on both sides within max(3 of its periods, ``max_gap_ns``).
@@ -143,7 +141,7 @@ def compute_power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tu
     return volt, amp, watt
 
 
-def _is_near_samples(stamp_ns: Stamps, at_ns: Stamps, max_gap_ns: int) -> NDArray[np.bool_]:
+def _is_near_samples(stamp_ns: Ints, at_ns: Ints, max_gap_ns: int) -> NDArray[np.bool_]:
     """Return whether each time, shape (M,), is that of a sample, or between two that are near each other."""
     if stamp_ns.size == 0:
         return np.zeros(at_ns.size, np.bool_)

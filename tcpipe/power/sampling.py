@@ -20,12 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.power.rails import Rail, Rule, SampledSignal, integrate_energy
 from tcpipe.tables.facts import Smoothing
 from tcpipe.tables.findings import read_threshold
-
-Stamps = NDArray[np.int64]
 
 _FEWEST_INTERVALS = 20
 _LEAST_MESSAGES = 1.5
@@ -41,7 +39,7 @@ _JUMPING_SHARE = 0.1
 """Smallest share of changes by more than one level."""
 
 
-def find_readings(stamp_ns: Stamps, values: Floats) -> NDArray[np.int64] | None:
+def find_readings(stamp_ns: Ints, values: Floats) -> NDArray[np.int64] | None:
     """Return the rows on which new readings arrived, shape (R,); None where messages do not surely repeat readings.
 
     A reading that equals the one before it shows no change: its row is the one at which it is expected. ``stamp_ns`` [ns], shape (N,), does
@@ -115,7 +113,7 @@ _CLEARLY = 0.9
 
 
 def is_stated_averaged(
-    power_ns: Stamps, power_watt: Floats, motion_ns: Stamps, forward_mps: Floats, yaw_rate_radps: Floats
+    power_ns: Ints, power_watt: Floats, motion_ns: Ints, forward_mps: Floats, yaw_rate_radps: Floats
 ) -> bool | None:
     """Return whether each value is the mean since the one before it (True) or sampled (False); None where motion shows neither.
 
@@ -190,7 +188,7 @@ class PowerFit:
 
 
 def make_power_fit(
-    power: SampledSignal, motion_ns: Stamps, motion: Floats, *, averaged: bool, margin_s: float
+    power: SampledSignal, motion_ns: Ints, motion: Floats, *, averaged: bool, margin_s: float
 ) -> PowerFit | None:
     """Return the power samples that have known motion around them; None for fewer than 60.
 
@@ -282,7 +280,7 @@ _USUAL_DELAY_S = 0.03
 
 
 def estimate_delay_variance(
-    rails: list[Rail], start_ns: Stamps, end_ns: Stamps, delay_s: float, std_s: float, *, rule: Rule
+    rails: list[Rail], start_ns: Ints, end_ns: Ints, delay_s: float, std_s: float, *, rule: Rule
 ) -> Floats:
     """Return the mean square of what a delay of power changes of each span's energy [J²], shape (M,); 0 where it is unknown.
 

@@ -21,14 +21,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.power.plausibility import REJECTED
 from tcpipe.power.rails import UNIT_VOLT, is_power_only
 from tcpipe.robots import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 Columns = Mapping[str, NDArray[Any]]
-Stamps = NDArray[np.int64]
 HuskyPower = Literal["battery", "drivers"]
 
 NAMES, SPEED, TORQUE = "name[]", "velocity", "effort"
@@ -314,7 +313,7 @@ _BESIDE, _CROWDED = 20, 10.0
 """Levels next to the end of a range, and how many times as many values as on one of them are at the end of a clipped current."""
 
 
-def find_unmeasured(parts: Floats, stamp_ns: Stamps, *, wraps_amp: float | None = None) -> NDArray[np.bool_]:
+def find_unmeasured(parts: Floats, stamp_ns: Ints, *, wraps_amp: float | None = None) -> NDArray[np.bool_]:
     """Return the rows in which one of several currents, shape (N, K), is clipped, or repeats a value while another changes, shape (N,)."""
     found = np.zeros(len(parts), np.bool_)
     parts = np.where(np.abs(parts) <= _IMPOSSIBLE, parts, np.nan)
@@ -339,7 +338,7 @@ def _is_clipped(values: Floats) -> NDArray[np.bool_]:
     return at_end if 2 * stays.sum() >= at_end.sum() else np.zeros_like(at_end)
 
 
-def _is_frozen(values: Floats, others: Floats, stamp_ns: Stamps) -> NDArray[np.bool_]:
+def _is_frozen(values: Floats, others: Floats, stamp_ns: Ints) -> NDArray[np.bool_]:
     """Return where a current repeats one value for seconds while one of the others, shape (N, K), changes as in driving."""
     frozen = np.zeros(len(values), np.bool_)
     first = np.flatnonzero(np.concatenate(([True], values[1:] != values[:-1])))
@@ -492,7 +491,7 @@ class Counter:
         """Return the counter with its energy multiplied."""
         return replace(self, energy_joule=factor * self.energy_joule)
 
-    def mean_amp(self, stamp_ns: Stamps, voltage_volt: Floats) -> Floats:
+    def mean_amp(self, stamp_ns: Ints, voltage_volt: Floats) -> Floats:
         """Return the mean current since the row before [A], at the row's voltage [V], shape (N,); stamps in [ns].
 
         So voltage times current, held backwards from each stamp as of any source that averages, is what was counted. NaN on the first row,

@@ -1,8 +1,7 @@
 """Worlds and drives with known truth, written as real logs and GeoTIFFs.
 
-`simulate` writes a whole site. In pieces: a `scenarios.Scenario` holds a `world.World`, drives (`route` says where to, `faults` what goes
-wrong, `sensors` how strongly) and the rasters' grids; `simulate_readings` gives the truth and the readings of one drive in memory;
-`truth.compute_true_cost` is the cost of the true metre that begins at any time.
+`simulate` writes a whole site: a `scenarios.Scenario` of a `world.World`, drives (routes and faults) and the rasters' grids.
+`simulate_readings` returns truth and readings of one drive; `truth.compute_true_cost` the cost of the true metre from any time.
 """
 
 from tcpipe.simulation.scenarios import Scenario, find_scenario, make_tiny

@@ -24,7 +24,7 @@ DATA_MODEL_VERSION = "4.0"
 
 TABLES_VERSION = "4.0"  # in which a table last changed
 
-RESULTS_VERSION = 4
+RESULTS_VERSION = 5
 """Raised when the same log and recipe give other values in a table: runs of an earlier one are ingested again."""
 
 

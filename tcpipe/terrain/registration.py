@@ -1,11 +1,10 @@
 """Registration of a map to a track by the heights of the ground under it: the horizontal shift, and the unit of the map's heights.
 
-Heights of track and map differ by a constant (geoid, the robot's own height). The rest is the shape of the ground. The shift at which the
-two shapes agree best is searched on a lattice, as in terrain-aided navigation (Hollowell 1990; Nuth & Kääb 2011), and refined by a
-paraboloid through the squared misfits. A tilt of the map and a drift of the track's heights, which look like a shift on a smooth hill, are
-fitted with it. The shift's uncertainty is the scatter of the best shift among blocks of the path drawn at random (block bootstrap, Künsch
-1989), since errors of GNSS are alike over seconds, and those of the map over metres. It is large along directions in which the ground does
-not vary, or repeats itself: there the shift is not observable, and stays zero.
+Heights of track and map differ by a constant and by the shape of the ground. The shift at which the shapes agree best is searched on a
+lattice (terrain-aided navigation, Hollowell 1990; Nuth & Kääb 2011) and refined by a paraboloid through the squared misfits. A tilt of the
+map and a drift of the track's heights, which look like a shift on a smooth hill, are fitted with it. The shift's standard deviation is the
+scatter of the best shift among random draws of blocks of the path (block bootstrap, Künsch 1989), since errors of GNSS are correlated over
+seconds, and those of the map over metres. A shift along which the ground does not vary, or repeats itself, is not observable and stays zero.
 """
 
 from __future__ import annotations
@@ -14,17 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.sampling_kernel import compute_morton
 from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_tile_window
-
-Rows = NDArray[np.int64]
 
 REACH_M, KNOWN_M = 4.0, 0.25
 """Shifts are searched this far each way; a direction is not determined if the shift's standard deviation along it is larger [m]."""
@@ -57,8 +53,7 @@ _CHI2_999 = 13.82
 """99.9 % of χ² with two degrees of freedom."""
 _LEAST_GAIN = -2.0 * np.log(0.9)
 """A shift that leaves more than 90 % of the misfit is not what was wrong."""
-_RIDGE = 1e-12
-"""Smallest divisor."""
+_RIDGE = 1e-12  # smallest divisor
 _UNITS = {0.3048: "ft", 0.1: "dm", 0.01: "cm", 0.001: "mm"}
 _UNITS |= {1.0 / metres: "m" for metres in _UNITS}
 """Unit of a map's heights by their scale; metres that were converted from another unit by mistake have its inverse."""
@@ -132,14 +127,10 @@ class Registration:
         return float(max(variances[variances < KNOWN_M**2] ** 0.5, default=np.nan))
 
     @property
-    def axis_std_m(self) -> Floats:
-        """Standard deviations of the shift along both axes [m], NaN unless it is determined in both directions."""
-        return np.sqrt(np.diag(self.covariance)) if _count_known(self.covariance) > 1 else np.full(2, np.nan)
-
-    @property
     def position_std_m(self) -> float:
         """DRMS of the shift [m], NaN unless it is determined in both directions."""
-        return float(np.hypot(*self.axis_std_m))
+        is_known = np.linalg.eigvalsh(self.covariance)[-1] < KNOWN_M**2
+        return float(np.sqrt(np.trace(self.covariance))) if is_known else np.nan
 
     @property
     def left_m(self) -> float:
@@ -159,13 +150,13 @@ def register_track(source: MapReader, xy_m: Floats, height_m: Floats) -> Registr
     height_m : their heights above any surface, shape (N,) [m].
     """
     level, (xy_m, height_m) = choose_level(source, _STEP_M), _thin_track(xy_m, height_m)
-    rows = np.flatnonzero(level.grid.contains(xy_m))
-    ground_m = _sample_heights(level, xy_m[rows])
+    inside = level.grid.contains(xy_m)
+    xy_m, height_m = xy_m[inside], height_m[inside]
+    ground_m = _sample_heights(level, xy_m)
     whole = np.isfinite(ground_m).all(axis=(1, 2))
     if whole.sum() < _FEWEST_POINTS:
         return None
-    rows, ground_m = rows[whole], ground_m[whole]
-    xy_m, height_m = xy_m[rows], height_m[rows]
+    xy_m, height_m, ground_m = xy_m[whole], height_m[whole], ground_m[whole]
     excess_m = ground_m - height_m[:, None, None]
     near, good = _find_ground(excess_m, xy_m)
     if near.sum() < _FEWEST_POINTS:
@@ -198,7 +189,7 @@ def _sample_heights(level: MapReader, xy_m: Floats) -> Floats:
     return found + level.height_reference_m
 
 
-def _find_ground(excess_m: Floats, xy_m: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _find_ground(excess_m: Floats, xy_m: Floats) -> tuple[Mask, Mask]:
     """Return the points on the map's ground at the shift that fits best, (N,), and those of them that determine a shift.
 
     These are not on cliffs, unless too few are left.
@@ -233,7 +224,7 @@ def _find_least(spread: Floats) -> tuple[int, int]:
     return int(i), int(j)
 
 
-def _flatten(excess_m: Floats, xy_m: Floats) -> tuple[Floats, Floats, Rows]:
+def _flatten(excess_m: Floats, xy_m: Floats) -> tuple[Floats, Floats, Ints]:
     """Return the excess without tilt and drift, constant in each stretch of path; the columns of a tilt, (N, 2); each point's block."""
     path_m = np.cumsum(np.hypot(*np.diff(xy_m, axis=0, prepend=xy_m[:1]).T))
     count = max(_BLOCKS, round(float(path_m[-1]) / _DRIFT_M))
@@ -269,7 +260,7 @@ def _regress_heights(ground_m: Floats, height_m: Floats) -> HeightScale:
     along, first = ground[:, *best], np.arange(_BLOCKS) * len(height) // _BLOCKS
     without = products[best] - np.add.reduceat(along * height, first)
     without /= squares[best] - np.add.reduceat(along**2, first) + _RIDGE
-    std = float(np.sqrt(_estimate_covariance(without[:, None])[0, 0]))
+    std = float(without.std() * np.sqrt(_BLOCKS - 1.0))  # jackknife
     return HeightScale(float(products[best] / (squares[best] + _RIDGE)), std, float(explained[best]))
 
 
@@ -306,7 +297,7 @@ def _refine_shift(near_m: Floats, good_m: Floats, xy_m: Floats, scale: HeightSca
     )
 
 
-def _resample_squares(flat_m: Floats, tilt: Floats, block: Rows) -> Floats:
+def _resample_squares(flat_m: Floats, tilt: Floats, block: Ints) -> Floats:
     """Return the squared misfits of all points, and of blocks drawn at random, shape (1 + draws, K, K), each without tilt."""
     flat, count = flat_m.reshape(len(flat_m), -1), int(block.max()) + 1
     drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), _DRAWS)
@@ -319,7 +310,7 @@ def _resample_squares(flat_m: Floats, tilt: Floats, block: Rows) -> Floats:
     return np.asarray(squares.reshape(-1, *flat_m.shape[1:]))
 
 
-def _fit_paraboloids(misfits: Floats, at: Rows | None = None) -> tuple[Rows, Floats]:
+def _fit_paraboloids(misfits: Floats, at: Ints | None = None) -> tuple[Ints, Floats]:
     """Return the indices (north, east) of the least of each misfit, (R, 2), and the paraboloid around it, (R, 6), as `_expand_square`."""
     near = sliding_window_view(misfits, (2 * _NEAR + 1,) * 2, axis=(1, 2))
     if at is None:
@@ -327,14 +318,3 @@ def _fit_paraboloids(misfits: Floats, at: Rows | None = None) -> tuple[Rows, Flo
         at = np.stack(np.unravel_index(inner.reshape(len(inner), -1).argmin(axis=1), inner.shape[1:]), axis=1) + _NEAR
     windows = near[np.arange(len(misfits)), *(at - _NEAR).T]
     return at, windows.reshape(len(misfits), -1) @ _PARABOLOID.T
-
-
-def _estimate_covariance(without: Floats) -> Floats:
-    """Return the covariance of an estimate by its values with each block left out, shape (B, K)."""
-    spread = without - without.mean(axis=0)
-    return np.asarray((len(without) - 1) / len(without) * spread.T @ spread)
-
-
-def _count_known(covariance: Floats) -> Rows:
-    """Return how many directions a covariance, (..., 2, 2) [m²], determines."""
-    return np.asarray((np.linalg.eigvalsh(covariance) < REACH_M**2 / 2.0).sum(axis=-1))
