@@ -16,6 +16,7 @@ import stat
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from numbers import Number
 from typing import Any
 
@@ -79,7 +80,16 @@ def compile_kernel(function: Callable[..., Any]) -> Any:
     if isinstance(compiled, Dispatcher):  # it is none where NUMBA_DISABLE_JIT is set
         index = _index_of(compiled)
         index._source_stamp = _stamp(index._source_stamp, function)  # noqa: SLF001  numba has no public way to say what else there is
+        index._load_index = partial(_load_overloads, index._load_index)  # noqa: SLF001
     return compiled
+
+
+def _load_overloads(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:
+    """Return the cached overloads of a kernel; none if the cache of an earlier version names a class that no longer exists."""
+    try:
+        return load()
+    except (AttributeError, ImportError):
+        return {}
 
 
 def _stamp(source: bytes, function: Callable[..., Any]) -> str:

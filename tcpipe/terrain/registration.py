@@ -4,7 +4,7 @@ Heights of track and map differ by a constant and by the shape of the ground. Th
 lattice (terrain-aided navigation, Hollowell 1990; Nuth & Kääb 2011) and refined by a paraboloid through the squared misfits. A tilt of the
 map and a drift of the track's heights, which look like a shift on a smooth hill, are fitted with it. The shift's standard deviation is the
 scatter of the best shift among random draws of blocks of the path (block bootstrap, Künsch 1989), since errors of GNSS are correlated over
-seconds, and those of the map over metres. A shift along which the ground does not vary, or repeats itself, is not observable and stays zero.
+seconds, and those of the map over metres. A shift along which the ground does not vary, or repeats itself, is unobservable and stays zero.
 """
 
 from __future__ import annotations
