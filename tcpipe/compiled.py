@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from numbers import Number
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 from numba.core import event
@@ -26,6 +26,7 @@ from numba.core.cpu import CPUContext
 from numba.core.dispatcher import Dispatcher
 
 logger = logging.getLogger("tcpipe")
+_Key = TypeVar("_Key")
 
 
 class _Announce(event.Listener):  # type: ignore[misc]
@@ -84,7 +85,7 @@ def compile_kernel(function: Callable[..., Any]) -> Any:
     return compiled
 
 
-def _load_overloads(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:
+def _load_overloads(load: Callable[[], dict[_Key, str]]) -> dict[_Key, str]:
     """Return the cached overloads of a kernel; none if the cache of an earlier version names a class that no longer exists."""
     try:
         return load()
