@@ -49,6 +49,7 @@ from tcpipe.fusion.measurements import (
     IMU,
     NO_LEVER_ARM,
     NO_TRUST,
+    STATED_ARM_STD_M,
     UNSTATED_ARM_STD_M,
     WHEELS,
     InitialState,
@@ -397,6 +398,13 @@ def make_trajectory(
     links = _interpolate_links(smoothed, at, output_ns)
     if m.gnss is not None and not m.gnss.has_heights:
         position_variance[:, 2] += NO_TRUST
+    if (
+        m.gnss is not None and not m.has_absolute_tilt
+    ):  # an antenna of unknown height sways on slopes that nothing measures
+        height_m2 = max(0.0, m.gnss.lever_arm_std_m[2] ** 2 - STATED_ARM_STD_M[2] ** 2)
+        height_m2 += m.is_antenna_alone * m.gnss.lever_arm_m[2] ** 2
+        slope_variance = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2.0 * SLOPE_RAD**2)
+        links = links + slope_variance * height_m2
     if m.gnss is not None and m.is_antenna_alone:  # level, and along the course
         antenna = np.asarray(m.gnss.lever_arm_m)
         yaw = compute_course(velocity)
@@ -407,8 +415,6 @@ def make_trajectory(
         position -= rotation @ antenna
         position_variance[:, :2] += (yaw_variance * np.sum(antenna[:2] ** 2))[:, None]
         speed_variance += (UNSEEN_TURN_RADPS * antenna[2]) ** 2
-        slope_variance = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2.0 * SLOPE_RAD**2)
-        links = links + slope_variance * antenna[2] ** 2
     is_open = m.odometries() and not is_length_observable(m, noise.horizontal)
     scale_std = find_best_scale_std(m) if is_open else 0.0
     if m.gnss is None:

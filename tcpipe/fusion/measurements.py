@@ -194,10 +194,14 @@ class Measurements:
 
     @property
     def has_tilt(self) -> bool:
-        """Whether an IMU, a pose or a camera measures roll and pitch."""
+        """Whether an IMU or a pose measures roll and pitch, or a camera their changes."""
+        return self.has_absolute_tilt or (self.visual is not None and self.visual.turn_rate_radps is not None)
+
+    @property
+    def has_absolute_tilt(self) -> bool:
+        """Whether an IMU or a pose measures roll and pitch."""
         variance = None if self.gnss is None else self.gnss.rotation_variance_rad2
-        is_posed = variance is not None and float(variance[0, 0]) < UNMEASURED_RAD2
-        return is_posed or self.imu is not None or (self.visual is not None and self.visual.turn_rate_radps is not None)
+        return self.imu is not None or (variance is not None and float(variance[0, 0]) < UNMEASURED_RAD2)
 
     def odometries(self) -> dict[str, BodyVelocities]:
         """Return the odometries that are there, by role; the wheels' first."""
