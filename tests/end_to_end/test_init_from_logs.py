@@ -149,7 +149,7 @@ def test_an_unknown_robot_needs_two_lines(drive, tmp_path, *, robot, removing, t
 def test_inspect_preflight_and_init_propose_the_same(drive, tmp_path):
     log = tmp_path / "run.mcap"
     write_mcap(log, joints(drive))
-    inspected, expected = (run(command, log, "--robot", "generic").output for command in ("inspect", "preflight"))
+    inspected, expected = (run(command, log, "--robot", "generic").stdout for command in ("inspect", "preflight"))
     (tmp_path / "acme_msgs" / "msg").mkdir(parents=True)
     (tmp_path / "acme_msgs" / "msg" / "Other.msg").write_text("float32 data\n")
     call = ("init", tmp_path, "--from", log, "--robot", "generic", "--msgdef", tmp_path)

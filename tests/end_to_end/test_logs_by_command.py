@@ -67,7 +67,7 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
     cut.write_bytes(drive_at(tmp_path / "whole.mcap", seed=1).read_bytes()[:-20_000])
     junk.write_bytes(b"junk" * 100)
     assert "logs/junk.bag: not a log" in plain_lines(tcpipe("ingest", "logs", cwd=tmp_path), 3)
-    again = tcpipe("ingest", "logs", "--jobs", "8", cwd=tmp_path)
+    again = tcpipe("ingest", "logs", "--jobs", "8", "--quiet", cwd=tmp_path)
     assert (again.returncode, again.stderr) == (0, "")
     assert again.stdout.splitlines()[-3:] == [
         "nothing to do: 2 of 3 logs are in tcpipe-store already",

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 from xml.etree.ElementTree import Element, fromstring
 
-from tcpipe.formats.json_files import parse_typed
+from tcpipe.formats.json_files import parse_typed, to_plain
 from tcpipe.tables.findings import LEFT_OUT, Finding
 from tcpipe.terrain.layers import (
     PAPER_LAYERS,
@@ -200,7 +200,7 @@ def describe_layer(layer: Layer) -> Description:
     if layer.name in PAPER_LAYERS:
         return known
     table = () if layer.classes is None else layer.classes.classes
-    return {**known, "kind": layer.kind, **({"classes": [asdict(entry) for entry in table]} if table else {})}
+    return {**known, "kind": layer.kind, **({"classes": [to_plain(entry) for entry in table]} if table else {})}
 
 
 def read_layers(found: Mapping[str, Description], classes: Sequence[TerrainClass], path: Path) -> dict[str, Layer]:
