@@ -124,7 +124,7 @@ def test_every_call_is_recorded_with_its_exit_code_and_message_also_one_that_is_
 
 def test_an_internal_error_ends_a_call_with_exit_code_1(root, logs, monkeypatch):
     ingest([logs / "one.mcap"], store=root, recipe=Recipe())
-    monkeypatch.setattr(ingest_module, "plan", lambda *_: 1 // 0)
+    monkeypatch.setattr(ingest_module, "plan_ingestion", lambda *_: 1 // 0)
     with pytest.raises(ZeroDivisionError):
         ingest([logs], store=root, recipe=Recipe())
     assert read_calls(root)[-1] == ("ingest", 1, "ZeroDivisionError")

@@ -48,7 +48,7 @@ COMMANDS = {
 }
 
 
-WRITERS = ("build", "report with patches", "train")
+WRITERS = ("build", "report", "train")
 
 
 @pytest.mark.parametrize(("first", "second"), [*product(WRITERS, COMMANDS)])
