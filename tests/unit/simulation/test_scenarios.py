@@ -15,7 +15,9 @@ PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "simulation.md").read
 
 def test_the_reference_names_every_scenario_and_fault():
     heads = re.findall(r"^- (`\w+`(?:, `\w+`)*):", PAGE, flags=re.MULTILINE)
-    assert {name for head in heads for name in re.findall(r"\w+", head)} == set(SCENARIOS) | {field.name for field in fields(Faults)}
+    assert {name for head in heads for name in re.findall(r"\w+", head)} == set(SCENARIOS) | {
+        field.name for field in fields(Faults)
+    }
 
 
 @pytest.mark.parametrize("name", sorted(SCENARIOS))
