@@ -39,13 +39,12 @@ from adapted_drives import compare_adaptations
 from tcpipe import ingest
 from tcpipe.cost.adaptation import MeasuredRun, Metres
 from tcpipe.cost.physics import ALL, FitSamples, fit_physics
-from tcpipe.cost.prediction_errors import QuantityErrors as PredictionErrors
-from tcpipe.cost.prediction_errors import fit_bias_correction, fit_errors
+from tcpipe.cost.prediction_errors import QuantityErrors, fit_bias_correction, fit_errors
 from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.learning.metrics import (
     LEAST,
     LEAST_VELOCITY_MPS,
-    QuantityErrors,
+    Errors,
     Spread,
     compute_costs,
     compute_errors,
@@ -175,7 +174,7 @@ def told(fit: Callable[[Metre], Predictor], known: Metre, there: Metre) -> Told:
 
 def centred(
     fit: Callable[[Metre], Predictor], known: Metre, there: Metre
-) -> tuple[dict[str, Floats], dict[str, PredictionErrors]]:
+) -> tuple[dict[str, Floats], dict[str, QuantityErrors]]:
     """Return what a fit to some metres says of others, and what it states of its errors by folds of the first."""
     folds, held = _folds(len(known.power)), np.empty((len(known.power), 2))
     for fold in np.unique(folds):
@@ -264,7 +263,7 @@ def own_mean(of: Metre) -> Told:
     )
 
 
-def _row(names: tuple[str, ...], of: QuantityErrors, quantity: str, scatter: float) -> str:
+def _row(names: tuple[str, ...], of: Errors, quantity: str, scatter: float) -> str:
     unit, digits = UNITS[quantity]
     assert of.rmse is not None, "no labels"
     mape = "–" if of.mape_percent is None else f"{of.mape_percent:.1f} ({of.mape_count} of {of.count})"
