@@ -34,7 +34,7 @@ def main() -> None:
     labels = [100.0, 0.8] + [20.0, 0.1] * ground + rng.normal(size=ground.shape) * [5.0, 0.02]
     began = time.process_time()
     folds, rules = rng.integers(0, 5, count), {"channels": CHANNELS, "class_count": CLASSES}
-    model, _, count_of_trees = fit_table(features, labels, np.ones_like(labels), folds, **rules)
+    model, _, count_of_trees = fit_table(features, labels, folds, **rules)
     grown_s = time.process_time() - began
     many = np.resize(features, (TOLD, 16))
     model.predict(many[:10])

@@ -11,7 +11,6 @@ from __future__ import annotations
 import sys
 import time
 
-import numpy as np
 import torch
 
 from tcpipe.dataset import open_dataset
@@ -41,7 +40,7 @@ def main() -> None:
         began = time.process_time()
         patches, labels = next(endless)
         fed = time.process_time()
-        trainer.step(patches, labels, np.ones_like(labels), 1e-4)
+        trainer.step(patches, labels, 1e-4)
         trained = time.process_time()
         trainer.network.predict(patches)
         predicted = time.process_time()
