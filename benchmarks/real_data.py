@@ -136,7 +136,7 @@ def by_trees(of: Metre) -> Predictor:
         return np.column_stack([there.rise, there.turn_radpm, there.command])
 
     labels = np.column_stack([of.power, of.velocity])
-    texts, _, _ = grow(features(of), labels, np.ones_like(labels), _folds(len(labels)))
+    texts, _, _ = grow(features(of), labels, _folds(len(labels)))
     trees = [lightgbm.Booster(model_str=text) for text in texts]
 
     def predict(there: Metre) -> Floats:
