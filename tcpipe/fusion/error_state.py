@@ -405,6 +405,8 @@ def make_trajectory(
         height_m2 += m.is_antenna_alone * m.gnss.lever_arm_m[2] ** 2
         slope_variance = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2.0 * SLOPE_RAD**2)
         links = links + slope_variance * height_m2
+        if m.has_tilt:  # noise of a camera's roll looks like sway, so the height is known no better than it was stated
+            position_variance += m.gnss.lever_arm_std_m[2] ** 2 * rotation[:, :, 2] ** 2
     if m.gnss is not None and m.is_antenna_alone:  # level, and along the course
         antenna = np.asarray(m.gnss.lever_arm_m)
         yaw = compute_course(velocity)
