@@ -23,7 +23,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from map_worlds import ArrayMap
+from map_worlds import ArrayMap, make_waves
 from physics_model import PhysicsModel
 
 from tcpipe.errors import PathError
@@ -61,18 +61,9 @@ MODEL = replace(Robot(patch_px=8), training_range=RANGES)
 
 def make_site(metres: int) -> ArrayMap:
     """Return a hilly map of four classes with obstacles."""
-    rng, count = np.random.default_rng(3), round(metres / PIXEL_M)
-    at = (np.arange(count) + 0.5) * PIXEL_M
-    east, north = np.meshgrid(at, at[::-1])
-    height, field = np.zeros(east.shape), np.zeros(east.shape)
-    for wave_m in (metres / 2, metres / 5, metres / 12):
-        a, b = rng.uniform(0.0, 2.0 * np.pi, 2)
-        height += 0.08 * wave_m * np.sin(east / wave_m * 2 + a) * np.cos(north / wave_m * 2 + b)
-    for _ in range(12):
-        wave_m, course, phase = rng.uniform(8.0, 60.0), rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, 2.0 * np.pi)
-        field += np.sin((east * np.cos(course) + north * np.sin(course)) / wave_m + phase)
-    terrain = np.select([field < -4.2, field < -1.0, field < 2.0], [2, 4, 5], 6).astype(np.uint8)
-    layers = {"height": height.astype(np.float32), "ortho": np.full(east.shape, 128, np.uint8), "terrain": terrain}
+    count = round(metres / PIXEL_M)
+    height, terrain = make_waves((np.arange(count) + 0.5) * PIXEL_M, (metres / 2, metres / 5, metres / 12), 0.08)
+    layers = {"height": height.astype(np.float32), "ortho": np.full(height.shape, 128, np.uint8), "terrain": terrain}
     return ArrayMap(MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, PIXEL_M, count, count), layers, 128)
 
 

@@ -28,7 +28,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from map_worlds import ArrayMap
+from map_worlds import ArrayMap, make_waves
 from physics_model import PhysicsModel, power_watt, velocity_mps
 from planning_worlds import lonlat
 
@@ -57,19 +57,10 @@ MODEL = replace(PhysicsModel(), physics=FIT, training_range=RANGES)
 
 def make_site(cells: int) -> tuple[LazyCostGrid, NDArray[np.uint8]]:
     """Return a site whose costs are known, and the class of each cell."""
-    rng, at = np.random.default_rng(3), (np.arange(2 * cells) + 0.5) * 0.5
-    east, north = np.meshgrid(at, at[::-1])
-    height, field = np.zeros(east.shape), np.zeros(east.shape)
-    for wave_m in (cells / 2, cells / 5, cells / 15):
-        a, b = rng.uniform(0.0, 2.0 * np.pi, 2)
-        height += 0.02 * wave_m * np.sin(east / wave_m * 2 + a) * np.cos(north / wave_m * 2 + b)
-    for _ in range(12):
-        wave_m, course, phase = rng.uniform(8.0, 60.0), rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, 2.0 * np.pi)
-        field += np.sin((east * np.cos(course) + north * np.sin(course)) / wave_m + phase)
-    terrain = np.select([field < -4.2, field < -1.0, field < 2.0], [2, 4, 5], 6).astype(np.uint8)
+    height, terrain = make_waves((np.arange(2 * cells) + 0.5) * 0.5, (cells / 2, cells / 5, cells / 15), 0.02)
     class_id = terrain[::2, ::2].copy()
     terrain = class_id.repeat(2, axis=0).repeat(2, axis=1)
-    layers = {"height": height.astype(np.float32), "ortho": np.full(east.shape, 128, np.uint8), "terrain": terrain}
+    layers = {"height": height.astype(np.float32), "ortho": np.full(height.shape, 128, np.uint8), "terrain": terrain}
     grid = MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 0.5, 2 * cells, 2 * cells)
     source = ArrayMap(grid, layers, 512)
     middle = height.reshape(cells, 2, cells, 2).mean(axis=(1, 3))

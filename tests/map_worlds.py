@@ -19,6 +19,21 @@ from tcpipe.terrain.resampling import iterate_levels, make_overview_grid
 from tcpipe.terrain.target_grid import MapGrid
 
 
+def make_waves(at_m, waves_m, steepness):
+    """Return height [m] and class of a square site at places along its sides [m]: waves of these lengths, four classes, obstacles (2)."""
+    rng = np.random.default_rng(3)
+    east, north = np.meshgrid(at_m, at_m[::-1])
+    height, field_of_class = np.zeros(east.shape), np.zeros(east.shape)
+    for wave_m in waves_m:
+        a, b = rng.uniform(0.0, 2.0 * np.pi, 2)
+        height += steepness * wave_m * np.sin(east / wave_m * 2 + a) * np.cos(north / wave_m * 2 + b)
+    for _ in range(12):
+        wave_m, course, phase = rng.uniform(8.0, 60.0), rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, 2.0 * np.pi)
+        field_of_class += np.sin((east * np.cos(course) + north * np.sin(course)) / wave_m + phase)
+    class_id = np.select([field_of_class < -4.2, field_of_class < -1.0, field_of_class < 2.0], [2, 4, 5], 6)
+    return height, class_id.astype(np.uint8)
+
+
 @dataclass(frozen=True)
 class World:
     """A square site of ``side_m`` around a point of a projected CRS."""

@@ -27,7 +27,7 @@ that err as they did in training do not change that. Against the true cost, whic
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,10 +102,6 @@ class SumDistribution:
         """Return the probability that the true sum does not exceed a limit."""
         std = float(np.hypot(self.std_above if limit > self.middle else self.std_below, self.common_std))
         return float(ndtr((limit - self.middle) / std)) if std else float(limit >= self.middle)
-
-    def __add__(self, other: SumDistribution) -> SumDistribution:
-        """Return the distribution of both paths together: on the same ground a model errs alike, so that standard deviations add up."""
-        return SumDistribution(*(getattr(self, entry.name) + getattr(other, entry.name) for entry in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)

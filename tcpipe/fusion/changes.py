@@ -279,7 +279,7 @@ def compute_evidence(tests: Tests, gates: Floats) -> float:
 _EXCURSION_STDS, _MAX_EXCURSION_RATIO = 4.0, 2.0
 """Standard deviations of a residual that noise does not reach, and ratio of the residuals of two odometries that confirm each other [1]."""
 _MIN_RESIDUAL_VARIANCE = 1e-6
-"""Of a residual [m²]."""
+"""Least variance of a residual [m²]; a pair of sensors without densities has none of its own."""
 _MIN_EXCURSION_WINDOWS, _SHORT_WINDOW_S, _EXCURSION_WINDOW_S = 3, 4.0, 8.0
 """Overlapping windows [1], the shortest that are compared [s], and the longest of a step or of a wrong lever arm in a turn [s]."""
 
@@ -290,10 +290,8 @@ def find_excursions(residuals: Sequence[Residuals], noise: NoiseModel, ticks: Ti
     A step at t is beyond in every window that holds t, an excursion only in windows as long as itself: where short windows are farther
     beyond, there is a step.
     """
-    size, of_fixes = (
-        ticks.stamp_ns.size,
-        [each for each in residuals if GNSS in each.pair and each.time_s > _SHORT_WINDOW_S],
-    )
+    size = ticks.stamp_ns.size
+    of_fixes = [each for each in residuals if GNSS in each.pair and each.time_s > _SHORT_WINDOW_S]
     found = sorted(
         (run for pair in combinations(of_fixes, 2) for run in _find_excursion_runs(*pair, noise)), reverse=True
     )

@@ -398,14 +398,13 @@ def make_trajectory(
     links = _interpolate_links(smoothed, at, output_ns)
     if m.gnss is not None and not m.gnss.has_heights:
         position_variance[:, 2] += NO_TRUST
-    if (
-        m.gnss is not None and not m.has_absolute_tilt
-    ):  # an antenna of unknown height sways on slopes that nothing measures
+    if m.gnss is not None and not m.has_absolute_tilt:
+        # On slopes that nothing measures an antenna of unknown height moves sideways.
         height_m2 = max(0.0, m.gnss.lever_arm_std_m[2] ** 2 - STATED_ARM_STD_M[2] ** 2)
         height_m2 += m.is_antenna_alone * m.gnss.lever_arm_m[2] ** 2
         slope_variance = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2.0 * SLOPE_RAD**2)
         links = links + slope_variance * height_m2
-        if m.has_tilt:  # noise of a camera's roll looks like sway, so the height is known no better than it was stated
+        if m.has_tilt:  # noise of the camera's roll looks like another height: its stated uncertainty stays
             position_variance += m.gnss.lever_arm_std_m[2] ** 2 * rotation[:, :, 2] ** 2
     if m.gnss is not None and m.is_antenna_alone:  # level, and along the course
         antenna = np.asarray(m.gnss.lever_arm_m)

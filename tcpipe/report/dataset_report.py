@@ -70,7 +70,7 @@ class SamplesShown:
 
 
 def render_dataset_report(directory: Path, beside: Path | None = None, *, samples: pa.Table | None = None) -> str:
-    """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is no dataset of this data model.
+    """Return the HTML page of the dataset in ``directory``; `DatasetError` for another data model.
 
     ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too.
     ``samples`` has at least
