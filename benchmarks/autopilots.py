@@ -1,8 +1,8 @@
 """Reading logs of autopilots into columns: CPU time against their makers' readers, pyulog and pymavlink.
 
-Run by hand: ``python benchmarks/autopilots.py [--minutes M] [LOG...]``. Without logs it writes a drive of so many minutes in both formats.
-Reads alternate in one process and the least time of some counts; every column is decoded by both. It ends with 1 where tcpipe takes more
-than its share: 0.8 of pyulog's time, 0.1 of pymavlink's.
+Run by hand: ``python benchmarks/autopilots.py [--minutes M] [LOG...]``. Without logs it writes a drive of so many
+minutes in both formats. Reads alternate in one process and the least time of some counts; every column is decoded by
+both. It ends with 1 where tcpipe takes more than its share: 0.8 of pyulog's time, 0.1 of pymavlink's.
 """
 
 import argparse

@@ -1,12 +1,12 @@
-"""What a store, a dataset and a log in a bucket cost against those on disk.
+"""Measure the cost of a store, a dataset and a log in a bucket, as a ratio to the same on disk.
 
     . DIR/env && python benchmarks/buckets.py ingest s3://BUCKET DIRECTORY [TURNS]
     . DIR/env && python benchmarks/buckets.py build  s3://BUCKET DIRECTORY [SAMPLES]
     . DIR/env && python benchmarks/buckets.py camera s3://BUCKET DIRECTORY [GB]
 
-The directory keeps logs, stores and datasets; what is written to the bucket gets names of its own. Times are of turns taken by disk and
-bucket, the least of each. A log with a camera is made on its way into the bucket: random images, which no codec makes smaller, in
-chunks of their own beside those of a simulated drive of twelve minutes.
+The directory keeps logs, stores and datasets; outputs in the bucket get unique names. Disk and bucket take turns, and
+the shortest time of each counts. The log with a camera is generated while it is uploaded: random images, which no codec
+compresses, in chunks apart from those of a simulated drive of twelve minutes.
 """
 
 import os

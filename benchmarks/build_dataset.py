@@ -3,9 +3,10 @@
     python benchmarks/build_dataset.py DIRECTORY [SAMPLES …]
     python benchmarks/build_dataset.py DIRECTORY memory [SAMPLES …]    builds of patches of 4 x 4 pixels: memory that each sample adds
 
-Default 10,886 samples (the paper's) and 1,000,000. The directory keeps map and stores (`big_store`). CPU time of one process after a
-first small build (kernels loaded), the best of `REPEATS` builds of a small dataset, one of a large; memory as sampled 20 times a second:
-anonymous, and with mapped files that the system can drop. Tiles are counted as they are decoded, each of three layers.
+Default 10,886 samples (the paper's) and 1,000,000. The directory keeps map and stores (`big_store`). CPU time of one
+process after a first small build (kernels loaded), the best of `REPEATS` builds of a small dataset, one of a large;
+memory as sampled 20 times a second: anonymous, and with mapped files that the system can drop. Tiles are counted as
+they are decoded, each of three layers.
 """
 
 import os

@@ -5,9 +5,10 @@
     python benchmarks/campaign.py --out DIR --cells ": clean" --seeds 10    # calibration
     python benchmarks/campaign.py --list
 
-A cell is a set of sensors at a rate of GNSS under a fault (`campaign_faults.py`); its drives last four minutes on hills. What each gave
-is kept under DIR/cells and not made again: give another DIR for another state of the program. DIR/campaign.md and DIR/campaign.json hold
-the figures of all cells that are there, and the verdict on each: docs/internals/tests.md says what they mean.
+A cell is a set of sensors at a rate of GNSS under a fault (`campaign_faults.py`); its drives last four minutes on
+hills. What each gave is kept under DIR/cells and not made again: give another DIR for another state of the program.
+DIR/campaign.md and DIR/campaign.json hold the figures of all cells that are there, and the verdict on each:
+docs/internals/tests.md says what they mean.
 """
 
 from __future__ import annotations

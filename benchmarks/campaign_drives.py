@@ -1,7 +1,7 @@
-"""What the campaign drives: simulated drives in memory, their log as a reader of the pipeline takes it, and labels against the truth.
+"""Simulated drives of the campaign in memory, their logs, and the comparison of labels with the truth.
 
-A drive is simulated once for a route and a seed; its sensors are then read anew for every cell. No file is written: `MemoryLog` gives
-the stage `read` the tables that a log on disk would give, and the stages from there on are those of `tcpipe ingest`.
+A drive is simulated once for each route and seed; its sensors are sampled again for every cell. No file is written:
+`MemoryLog` gives the stage `read` the same tables as a log on disk, and all later stages are those of `tcpipe ingest`.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ Readings = Mapping[str, Reading]
 Messages = Sequence[MessageStream]
 
 QUANTITIES = {"T": "duration_s", "v": "velocity_mps", "w": "power_watt", "E": "energy_joule", "start": "position_m"}
-"""What is compared with the truth, and its column; the last is the start point's place."""
+"""Quantities that are compared with the truth, and their columns; the last is the position of the start point."""
 RING = float(np.sqrt(-np.log(0.05)))
-"""The radius over DRMS inside which 95 of 100 points lie where both axes err alike."""
+"""Radius that contains 95 % of the points, divided by DRMS [1], where both axes have the same error."""
 _GAP_S = 5.0
 TRACK = ("xy_m", "velocity_mps", "yaw_rad", "gap_xy_m", "gap_inside")
 FIRST_SEED = 501
@@ -61,7 +61,7 @@ _NO_SENSORS = Sensors(*[None] * 6)
 
 @dataclass(frozen=True)
 class Drive:
-    """What truly happened, where, and the random streams of its sensors."""
+    """True motion, its place, and the random streams of its sensors."""
 
     truth: Truth
     site: Site
@@ -81,10 +81,11 @@ class Drive:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a log, as what it changes on the way from the robot to the log; a new fault is one of these.
+    """Fault of a log, as the change that it makes between the robot and the log; a new fault is an instance of this class.
 
-    ``sensors`` changes the sensors as they really are, ``told`` what the log says of them (places, variances), ``readings`` what
-    they measured, ``messages`` what was recorded; ``route`` names the drive, ``true_ns`` leads from the track's time to the truth's.
+    ``sensors`` changes the true sensors, ``told`` what the log states about them (positions, variances), ``readings``
+    their measurements, ``messages`` the recorded messages; ``route`` names the drive, ``true_ns`` converts times of the
+    track to true times.
     """
 
     name: str
@@ -95,9 +96,9 @@ class Fault:
     said: str = ""
     """A regular expression that a finding or error is to hold; nothing has to be said where it is empty."""
     may_refuse: bool = False
-    """Whether a run without a segment is right: no sensor is left that could tell who is wrong, or nothing is to be labelled."""
+    """Whether a run without segments is correct: no sensor can show which other one is wrong, or there is nothing to label."""
     unseen_m: float = 0.0
-    """By how much start points may err as no sensor tells, though here they do not: this robot turns about base_link exactly."""
+    """Allowed error of start points that no sensor shows [m]; here 0, since this robot turns exactly about base_link."""
     route: str = "hills"
     calibrated: bool = False
     """Whether nothing is wrong at all: then deviations are to be as large as errors, and bits rare."""
@@ -269,7 +270,7 @@ def log_of(drive: Drive, sensors: Sensors, fault: Fault) -> MemoryLog:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one log gave, and how true it is; arrays have one value a labelled segment."""
+    """Result of one log and its errors; arrays have one value for each labelled segment."""
 
     start_s: list[float]
     """Since the drive began."""
@@ -283,7 +284,7 @@ class Outcome:
     """By the track."""
     true_m: float
     wheels_m: float
-    """The way that the wheels tell; NaN without."""
+    """Distance by the wheels [m]; NaN without wheels."""
     kept_m: float
     said: list[str]
     """Findings, or why there is no run."""
@@ -297,7 +298,7 @@ class Outcome:
     """By `TRACK`: RMS errors of the track's rows; the last of rows in gaps of the fixes, and the share of these inside `RING` DRMS."""
     cpu_s: float = 0.0
     trace: str = ""
-    """Where an error that nobody foresaw comes from."""
+    """Place in the code where an unexpected error was raised."""
 
 
 def outcome_of(drive: Drive, sensors: Sensors, fault: Fault) -> Outcome:
@@ -389,7 +390,7 @@ def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fa
 
 
 def wheels_m(read: Streams) -> float:
-    """Return the way that the wheels tell [m]; NaN without."""
+    """Return the distance by the wheels [m]; NaN without wheels."""
     if "wheel_odometry" not in read.tables:
         return float("nan")
     table = read.tables["wheel_odometry"]

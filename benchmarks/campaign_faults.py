@@ -1,7 +1,7 @@
-"""What the campaign tries: sets of sensors, rates, and faults, each fault one entry; a cell is a set at a rate under a fault.
+"""Cells of the campaign: sets of sensors, rates, and faults; a cell is one set at one rate with one fault.
 
-To add a fault, write an entry of `FAULTS` (see `Fault` in `campaign_drives.py`) and, where it wants another set of sensors or rate
-than all of them at 10 Hz, a line in `_ELSEWHERE`.
+To add a fault, write an entry of `FAULTS` (see `Fault` in `campaign_drives.py`) and, if it needs a set of sensors or a
+rate other than all sensors at 10 Hz, a line in `_ELSEWHERE`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ SETS: dict[str, frozenset[str]] = {
 }
 """By name, the sensors left out."""
 DOPPLER = ", Doppler"
-"""At the end of a set's name: its receiver tells its own velocity as well."""
+"""End of the name of a set whose receiver also reports velocity."""
 SETS |= {f"{name}{DOPPLER}": left for name, left in SETS.items() if "gnss" not in left}
 
 
@@ -60,7 +60,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """What ``--cells`` is matched with."""
+        """Text that ``--cells`` is matched with."""
         rate = "" if "gnss" in SETS[self.sensors] else f" {self.gnss_hz:g} Hz"
         return f"{self.sensors}{rate}: {self.fault.name}"
 
@@ -96,7 +96,7 @@ def move_fixes(reading: Reading, drive: Drive, enu_m: np.ndarray) -> Reading:
 
 
 def _claiming(reading: Reading, std_m: float, where: np.ndarray) -> Reading:
-    """Return fixes that claim a deviation, twice as large in height, where told."""
+    """Return fixes with a stated standard deviation, twice as large in height, if one is given."""
     covariance = reading.values["covariance"].copy()
     covariance[np.ix_(where, [0, 4, 8])] = np.square([std_m, std_m, 2 * std_m])
     return replace_values(reading, covariance=covariance)
@@ -253,7 +253,7 @@ def _few_rows(m: MessageStream, rows: np.ndarray) -> MessageStream:
 
 
 def _three_messages_beside(messages: Messages, _: Drive) -> Messages:
-    """Give the wheels a name that tells little, and three messages, over the whole log, the name that tells most."""
+    """Give the wheels an unspecific topic name, and three messages over the whole log the most specific one."""
     wheels = [m for m in messages if m.topic == _TOPICS["wheels"]]
     others = [m for m in messages if m.topic != _TOPICS["wheels"]]
     few = [_few_rows(m, np.array([0, m.log_time_ns.size // 2, m.log_time_ns.size - 1])) for m in wheels]
@@ -373,7 +373,7 @@ VELOCITY_FAULTS: dict[str, Fault] = {
         ("0.2 s late", None, "", shift_stamps(0.2)),
     )
 }
-"""Of a receiver's own velocity; in sets that have one."""
+"""Faults of the receiver's velocity, in sets that have one."""
 
 _PAIRED = ("wrong fix", "wheels 1.3 too fast", "IMU pitched by 5 deg", "GNSS 0.1 s late", "gyro at 0", "float minute")
 _WITHOUT_VISUAL = (

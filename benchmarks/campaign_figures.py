@@ -36,7 +36,7 @@ _DRAWS = 1000
 
 @dataclass(frozen=True)
 class Result:
-    """What one drive gave; ``oracle`` is how many segments there are without the sensors at fault, where there are none with them."""
+    """Result of one drive; ``oracle`` is the number of segments without the faulty sensors, if there are none with them."""
 
     seed: int
     outcome: Outcome
@@ -63,12 +63,12 @@ class Figures:
     rms: dict[str, float] = field(default_factory=dict)
     inside: dict[str, dict[int, Share]] = field(default_factory=dict)
     width: dict[str, float] = field(default_factory=dict)
-    """Median deviation over RMS error, with what no sensor could tell (`Fault.unseen_m`) in that."""
+    """Median standard deviation over RMS error, which includes the error that no sensor shows (`Fault.unseen_m`)."""
     doubted: float = float("nan")
     doubted_clean: float = 0.0
-    """Of the same sensors without a fault."""
+    """Figures of the same sensors without a fault."""
     kept_good: float = float("nan")
-    """Of the labels outside the fault's window whose errors are within twice those of the clean log, the share that no bit doubts."""
+    """Share without any flag among the labels outside the fault's window whose errors are at most twice those of the clean log."""
     good: float = float("nan")
     """The share of labels outside of the window whose errors are within twice those of the clean log."""
     bits: dict[str, float] = field(default_factory=dict)

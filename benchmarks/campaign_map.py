@@ -1,6 +1,7 @@
 """The campaign's one cell that is a map's: a height raster in a CRS of US survey feet, its heights in feet, and no word of that unit.
 
-A tiny drive is ingested and a dataset built on the map. Right is a refusal, or a word about feet, or slopes that are true all the same.
+A tiny drive is ingested and a dataset built on the map. Right is a refusal, or a word about feet, or slopes that are
+true all the same.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _PITCH_FT = 1.0
 
 @dataclass(frozen=True)
 class MapResult:
-    """What was said, whether there is no dataset, and how far its slopes are from the truth, RMS [deg]."""
+    """Messages, whether there is no dataset, and the RMS error of its slopes [deg]."""
 
     said: list[str]
     refused: bool
@@ -38,7 +39,7 @@ class MapResult:
 
     @property
     def failures(self) -> list[str]:
-        """What is not as it should be."""
+        """Return what differs from the expectation."""
         told = self.refused or any(re.search(r"\b(feet|foot)\b|map-height-scale", line) for line in self.said)
         return [] if told or self.slope_rms_deg < 2.0 else [f"slopes {self.slope_rms_deg:.0f} deg off, feet not named"]
 

@@ -2,10 +2,11 @@
 
     python benchmarks/cost_map.py [SIDE_M] [WIDTH]
 
-A site of SIDE_M x SIDE_M (default 16: some 3,500 patches), three layers at 0.05 m, in a store; ResNet-18 with random weights (WIDTH
-filters in its first stage; 64 is the paper's). The cost map is the whole of it: opening, decoding, sampling, judging, predicting,
-GeoTIFFs, Nav2 maps, checksums. Rounds alternate in one process. The ratio of the clock is what a user waits; that of CPU time does not
-depend on what else runs. Also: how much of the time sampling and judging take without the network.
+A site of SIDE_M x SIDE_M (default 16: some 3,500 patches), three layers at 0.05 m, in a store; ResNet-18 with random
+weights (WIDTH filters in its first stage; 64 is the paper's). The cost map is the whole of it: opening, decoding,
+sampling, judging, predicting, GeoTIFFs, Nav2 maps, checksums. Rounds alternate in one process. The ratio of the clock
+is what a user waits; that of CPU time does not depend on what else runs. Also: how much of the time sampling and
+judging take without the network.
 """
 
 import sys

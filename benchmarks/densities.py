@@ -1,12 +1,13 @@
 """Whether a run shows its own noise: ``python benchmarks/densities.py [--seeds 701 702] [--length 500] [--only NAME] [--log PATH]``.
 
-Simulated drives over hills with every sensor fault on but outages; the noise of the fixes is drawn here, from families that the estimator
-does not contain too, 5/3 times as large upwards, and the fixes claim its total. ``10 s`` and ``40 s``: standard deviation of the change of
-a fix's error over so long, fitted over true, least, median and largest of the seeds: what a filter takes, in the plane, then upwards.
-``false``: the correlated part that it takes on white noise. ``CPU``: the largest.
+Simulated drives over hills with every sensor fault on but outages; the noise of the fixes is drawn here, from families
+that the estimator does not contain too, 5/3 times as large upwards, and the fixes claim its total. ``10 s`` and ``40
+s``: standard deviation of the change of a fix's error over so long, fitted over true, least, median and largest of the
+seeds: what a filter takes, in the plane, then upwards. ``false``: the correlated part that it takes on white noise.
+``CPU``: the largest.
 
-With ``--log``, what real logs show: claimed, white and correlated parts of their fixes, their odometries and turns, and, where the robot is
-stationary, the residuals themselves, which need no model.
+With ``--log``, what real logs show: claimed, white and correlated parts of their fixes, their odometries and turns,
+and, where the robot is stationary, the residuals themselves, which need no model.
 """
 
 from __future__ import annotations

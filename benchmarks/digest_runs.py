@@ -1,7 +1,7 @@
 """The logs that `table_digests.py` ingests: simulated drives, copies of them with other messages, and third-party logs.
 
-`tcpipe.simulation` makes the drives. `mcap` and `rosbags` change the messages, so that this module uses no internal name of tcpipe.
-Add a new drive at the end of its table: the noise of a drive depends on its place there.
+`tcpipe.simulation` makes the drives. `mcap` and `rosbags` change the messages, so that this module uses no internal
+name of tcpipe. Add a new drive at the end of its table: the noise of a drive depends on its place there.
 """
 
 from __future__ import annotations
@@ -85,7 +85,8 @@ DRIVES: dict[str, Drive] = {
 """By name. The first six also make the datasets."""
 
 Change = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""From values, shape (messages, fields), or (messages, 1, elements) of an array field, and times since the log began [s] to values.
+"""From values, shape (messages, fields), or (messages, 1, elements) of an array field, and times since the log began
+[s] to values.
 
 Without fields: to a mask of the messages that stay."""
 Edit = tuple[str, tuple[str, ...], Change]
@@ -195,7 +196,7 @@ REAL = (
 
 
 def make_drives(out: Path, *, quick: bool) -> dict[str, Path]:
-    """Simulate the drives and copy some with changes, unless they lie below ``out``; return the logs by name."""
+    """Simulate the drives and copy some with changes, unless they exist below ``out``; return the logs by name."""
     listed = out / "logs.json"
     if listed.exists():
         found = list(json.loads(listed.read_text()).items())[: QUICK_DRIVES if quick else None]
@@ -282,7 +283,7 @@ def _put(message: Any, name: str, value: Any) -> None:
 
 
 def find_real_logs(data: Path, out: Path) -> Iterator[tuple[str, Path]]:
-    """Yield the third-party logs that are here by name, unpacked where they lie in an archive."""
+    """Yield the third-party logs that exist here by name, unpacked from their archives."""
     for name in REAL:
         archive, packed, inside = name.partition(".tar.xz/")
         if packed and (data / f"{archive}.tar.xz").exists():

@@ -2,7 +2,8 @@
 
     python benchmarks/error_budget.py
 
-The drive is the campaign's first, over hills, with every sensor; shares are of a segment's mean energy, and add in square.
+The drive is the campaign's first, over hills, with every sensor; shares are of a segment's mean energy, and add in
+square.
 """
 
 from __future__ import annotations

@@ -28,10 +28,10 @@ FROM, TO = "15.434471784,47.069643821", "15.434788601,47.069732605"
 
 @dataclass(frozen=True)
 class Case:
-    """One call, what was called before it, and which inputs it wants: ``log``, ``world`` (rasters and a store), ``model``, ``old`` store.
+    """One call, the calls before it, and the inputs that it needs: ``log``, ``world`` (rasters and a store), ``model``, ``old`` store.
 
-    What it writes lies in its directory, or below ``url``; a Dask cluster does its work where it wants ``cluster``. Steps are those of its
-    ``workers`` where it has some to be killed, each a process that `fault_workers` watches.
+    It writes to its directory or below ``url``; with ``cluster`` a Dask cluster does the work. Steps are those of its
+    ``workers`` if it has workers that can be killed, each a process that `fault_workers` watches.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Case:
     wants: frozenset[str] = frozenset()
     url: str = ""
     extra_features: Run | None = None
-    """What else is done at the same time where two things are; None: the same."""
+    """Second call of a pair that runs at the same time; None: the same call."""
     has_workers: bool = False
 
     @property
@@ -50,7 +50,7 @@ class Case:
 
 
 def _as_command(run: Run) -> Run:
-    """Return a call of something by the command line, which tells errors and signals."""
+    """Return a call by the command line, which reports errors and signals."""
 
     def called() -> None:
         from click import Command

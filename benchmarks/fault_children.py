@@ -1,9 +1,9 @@
 """One call in a forked child, broken at a chosen step or moment, and what it left on disk.
 
-A step is a moment at which Python is about to change the disk: it opens a file to write (or a directory, to lock or sync it), makes,
-renames or removes something. An audit hook counts them, so every state that a kill can leave between two of them is met once. Of a call
-that writes to a bucket a step is the moment before, and the one after, each request that changes something there; of one whose workers are
-killed, of each such request of theirs (`fault_workers`).
+A step is a moment at which Python is about to change the disk: it opens a file to write (or a directory, to lock or
+sync it), makes, renames or removes something. An audit hook counts them, so every state that a kill can leave between
+two of them is met once. Of a call that writes to a bucket a step is the moment before, and the one after, each request
+that changes something there; of one whose workers are killed, of each such request of theirs (`fault_workers`).
 """
 
 import atexit
@@ -43,12 +43,12 @@ LONGEST_S, LATEST_S = 600.0, 5.0
 """A call that takes longer hangs; one that is asked to end ends as fast."""
 
 STORES = ("tcpipe-store", "store")
-"""What is looked at as a reader does, by `see_store`: where calls write, and a copy of the store of the inputs."""
+"""Places that `see_store` reads as a user would: the outputs of calls, and a copy of the input store."""
 
 WHOLE = (
     "dataset*", "site", "model", "costs", *(f"{store}/{kind}/*" for store in STORES for kind in ("runs", "maps"))
 )  # fmt: skip
-"""What appears and changes as one: directories, and runs and maps of a store."""
+"""Units that appear and change as a whole: directories, and runs and maps of a store."""
 
 UNFINISHED = (
     ".tmp-*",
@@ -57,7 +57,7 @@ UNFINISHED = (
     "*.checkpoint",
     "tmp/tcpipe-*",
 )
-"""What a killed call may leave for the next one: temporaries, where a cost map and a training stand."""
+"""Files that a killed call may leave for the next one: temporary files, and the progress of a cost map or a training."""
 
 _REQUEST = "fault.request"
 _CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate"}
@@ -65,9 +65,9 @@ _CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.link", "os.sym
 
 @dataclass(frozen=True)
 class Fault:
-    """What befalls a call: a signal, or a disk that is full from then on (0), at a step, from 1, or after a time [s]; or so much room.
+    """Fault during a call: a signal, or a full disk (0), at a step (from 1) or after a time [s]; or limited disk space.
 
-    A ``victim`` is no call, but what it depends on: see `fault_services`.
+    A ``victim`` is not a call but a service that the call uses: see `fault_services`.
     """
 
     signal: int
@@ -87,7 +87,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a call ended; ``code`` as a shell tells it (137 for SIGKILL), ``late_s`` from the fault to the end."""
+    """End of a call; ``code`` is the exit status of a shell (137 for SIGKILL), ``late_s`` the time from the fault to the end [s]."""
 
     code: int
     said: str
@@ -262,7 +262,7 @@ def _is_change(args: tuple[object, ...], inside: str) -> bool:
 
 
 def _waited(child: int, deadline: float) -> int:
-    """Return the exit code of a child, as a shell tells it; 124 where it had to be killed for taking too long."""
+    """Return the exit status of a child as a shell gives it; 124 if it was killed because it took too long."""
     late = False
     while True:
         found, status = os.waitpid(child, os.WNOHANG)
@@ -344,7 +344,7 @@ def see_output(url: str) -> Tree:
 
 
 def _hash_file(place: Place, name: str) -> str:
-    """Return the hash of a file; "" where there is none."""
+    """Return the hash of a file; "" if it does not exist."""
     data = place.read(name)
     return "" if data is None else hashlib.sha256(data).hexdigest()
 

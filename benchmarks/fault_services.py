@@ -27,11 +27,11 @@ PROGRAM = "TCPIPE_TEST_OBJECT_STORAGE"
 """Names the program that starts the gateway; see tests/object_gateway.py."""
 
 OUTAGES_S = {"gateway stands still": 2.0, "gateway is killed": 1.0, "gateway is gone": 12.0}
-"""What befalls the gateway, and how long it lasts; a first request does not wait for the end of the last."""
+"""Faults of the gateway and their durations; a fault does not wait for the end of the one before."""
 
 
 VICTIMS = ("worker", "scheduler")
-"""Of a cluster."""
+"""Faults of a cluster and their durations."""
 
 
 class Services:
@@ -62,7 +62,7 @@ class Services:
             os.environ["TCPIPE_CLUSTER"] = self._cluster.address
 
     def strike(self, victim: str) -> None:
-        """Let something befall the gateway or the cluster."""
+        """Apply a fault to the gateway or the cluster."""
         if victim == "worker":
             for worker in self._cluster.workers[:1]:  # its nanny starts another
                 for child in Path(f"/proc/{worker.pid}/task/{worker.pid}/children").read_text().split():
@@ -128,7 +128,7 @@ def _make_bucket() -> None:
 
 
 def get_objects(url: str) -> dict[str, bytes]:
-    """Return what lies below a URL, by name; nothing below none."""
+    """Return the objects below a URL by name; none if there is no URL."""
 
     def get() -> dict[str, bytes]:
         place = open_place(url)

@@ -1,6 +1,7 @@
 """Kills a worker process before or after a chosen request that it makes to a bucket; counts the requests of all workers.
 
-Processes that are started meanwhile load this: the environment leads to ``struck/sitecustomize.py``, and to a file with the count.
+Processes that are started meanwhile load this: the environment leads to ``struck/sitecustomize.py``, and to a file with
+the count.
 """
 
 import fcntl
@@ -34,7 +35,7 @@ def watch(step: int) -> None:
 
 
 def count_steps() -> int:
-    """Return the steps there were; 0 where nobody counts."""
+    """Return the number of steps; 0 if no process counts them."""
     file = os.environ.get(_FILE)
     return Path(file).stat().st_size - _HEAD if file else 0
 

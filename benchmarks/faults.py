@@ -1,10 +1,11 @@
-"""What faults leave behind, and hostile inputs cost; docs/internals/faults.md says what is promised.
+"""Test what faults leave behind and what hostile inputs cost; docs/internals/faults.md has the promises.
 
-``python benchmarks/faults.py kills|signals|full-disk|services|together|faults|hostile|mutations|all``: every command that writes is
-broken at its steps (`fault_children`), at random moments, and by disks of several sizes; the object store and the cluster that it uses are
-stopped and killed under it (`fault_services`); two commands run at once. Then everything it left is looked at, and it is called again.
-Hostile inputs (`hostile_inputs`) and mutated logs are read. The exit code is 1 where something is not as promised. ``--only``, ``--steps``
-and ``--times`` make it shorter. Cases in a bucket and on a cluster are left out where TCPIPE_TEST_OBJECT_STORAGE names no gateway.
+``python benchmarks/faults.py kills|signals|full-disk|services|together|faults|hostile|mutations|all``: every command
+that writes is interrupted at its steps (`fault_children`), at random moments, and by full disks of several sizes; the
+object store and the cluster that it uses are stopped and killed (`fault_services`); two commands run at once. Then all
+outputs are checked, and the command is called again. Hostile inputs (`hostile_inputs`) and mutated logs are read. The
+exit code is 1 if a promise is broken. ``--only``, ``--steps`` and ``--times`` make it shorter. Cases in a bucket and on
+a cluster are left out if TCPIPE_TEST_OBJECT_STORAGE names no gateway.
 """
 
 import argparse
@@ -55,7 +56,7 @@ STRIKES = {
     "together": (),
 }
 LEFT_OVER = "left by a killed command"
-"""What `verify` says of payload that no document names: it waits for `prune`."""
+"""Message of `verify` about payload that no document names and that `prune` removes."""
 PROMISES = """
 false if: a final path is neither whole as before nor whole as after, at the moment of the fault or later; a reader sees damage then; the
 next identical call does not complete, or leaves other bytes than an undisturbed one, or any temporary; a process outlives its command; a
@@ -71,13 +72,13 @@ class Undisturbed:
     case: Case
     state: Path
     objects: dict[str, bytes]
-    """What lies in its bucket before."""
+    """Objects in its bucket before the call."""
     before: Tree
     after: Tree
     ended: Ended
     again: int
     size_bytes: int
-    """Of what it leaves."""
+    """Objects that it leaves."""
 
 
 def undisturbed(case: Case, work: Path) -> Undisturbed:
@@ -133,7 +134,7 @@ def _restore(state: Path, work: Path) -> None:
 
 
 def struck(plain: Undisturbed, work: Path, fault: Fault) -> list[str]:
-    """Let a fault befall a case, look, call it again, look; return what is not as promised."""
+    """Apply a fault to a case, check, call it again and check; return the broken promises."""
     case = plain.case
     _restore(plain.state, work)
     put_objects(case.url, plain.objects)
@@ -346,7 +347,7 @@ def hostile(options: argparse.Namespace) -> bool:
 
 
 def mutated(options: argparse.Namespace) -> bool:
-    """Read mutated logs: each loss and each change is told."""
+    """Read mutated logs: each loss and each change must be reported."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fuzz"))
     from mutated_logs import mutations
 

@@ -3,10 +3,10 @@
     python benchmarks/few_samples.py DATASET [--make] [--drives 32] [--metres 250] [--site-seed 11]
                                      [--counts 150 2000 5000] [--kinds auto linear …] [--seeds 1]
 
-With --make DATASET is made first, in its folder: drives over the small site of `tcpipe demo`, of which whole ones are held out; settings
-of kinds were chosen on other sites. A subset is the first so many training samples of a drawn order, another one for each seed; every
-kind is fitted to it as `tcpipe train` fits it, `auto` the one that it chooses. Another DATASET needs --holdout run. Predictions are not
-centred.
+With --make DATASET is made first, in its folder: drives over the small site of `tcpipe demo`, of which whole ones are
+held out; settings of kinds were chosen on other sites. A subset is the first so many training samples of a drawn order,
+another one for each seed; every kind is fitted to it as `tcpipe train` fits it, `auto` the one that it chooses. Another
+DATASET needs --holdout run. Predictions are not centred.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What `tcpipe preflight` makes of a drive's first minute against what the whole drive gives (docs/how-to/trust.md).
+"""Compare the verdict of `tcpipe preflight` on a drive's first minute with that on the whole drive (docs/how-to/trust.md).
 
 python benchmarks/first_minute.py DIRECTORY [SCENARIO …]
 """

@@ -1,13 +1,14 @@
 """CPU time and memory of the estimators, paired with compiled C++: ``python benchmarks/fuse.py [--hours 1 6]``.
 
-The log: a robot that winds over flat ground at 1 m/s with IMU 200 Hz, wheels 50 Hz, visual odometry 30 Hz and GNSS 10 Hz: 290 events a
-second, each one prediction and one update for the compiled C++; ``us/event`` is by these everywhere. (tcpipe's filters take the
-IMU as their process input and step less often than messages come; the same log is the same work.)
+The log: a robot that winds over flat ground at 1 m/s with IMU 200 Hz, wheels 50 Hz, visual odometry 30 Hz and GNSS 10
+Hz: 290 events a second, each one prediction and one update for the compiled C++; ``us/event`` is by these everywhere.
+(tcpipe's filters take the IMU as their process input and step less often than messages come; the same log is the same
+work.)
 
-The compiled C++ is `eigen_ukf15.cpp`, the step of robot_localization's UKF core on the same events; it needs g++ and Eigen
-(Debian: libeigen3-dev), else it is left out. Runs are interleaved, so that a busy machine slows all; the median of the paired ratios
-counts. Compilation is not counted. The last part fuses an hour, and six, through the whole stage, from streams to track, in processes of
-their own: how memory grows with the log.
+The compiled C++ is `eigen_ukf15.cpp`, the step of robot_localization's UKF core on the same events; it needs g++ and
+Eigen (Debian: libeigen3-dev), else it is left out. Runs are interleaved, so that a busy machine slows all; the median
+of the paired ratios counts. Compilation is not counted. The last part fuses an hour, and six, through the whole stage,
+from streams to track, in processes of their own: how memory grows with the log.
 """
 
 from __future__ import annotations

@@ -1,18 +1,21 @@
-"""How true the fused track is, and whether its covariance is: ``python benchmarks/fusion_accuracy.py [--drives 24] [--only NAME]``.
+"""Measure the errors of the fused track and of its covariance: ``python benchmarks/fusion_accuracy.py [--drives 24] [--only NAME]``.
 
-Simulated drives over hills with every sensor fault on; how strong each is stands in `fault_amplitudes.toml`, which was written before any
-tuning, as were the seeds. Errors are those of the standing and driving robot alike, rows within half a second of an outage's ends and
-inside it reported apart. ``xy`` is the length of the horizontal error vector, RMS; ``v`` that of the forward velocity.
+Simulated drives over hills with every sensor fault on; `fault_amplitudes.toml` has their amplitudes, which were written
+before any tuning, as were the seeds. Errors include those of the standing robot; rows inside an outage and within half
+a second of its ends are reported apart. ``xy`` is the length of the horizontal error vector, RMS; ``v`` that of the
+forward velocity.
 
-NEES is that of place, yaw and forward velocity by the deviations that a track carries, 5 degrees of freedom; ``inside`` the share of rows
-between the 2.5 % and 97.5 % quantiles of chi-square, ``below`` that under the upper one. Without GNSS neither position nor yaw has
-anything to be compared with. The next columns ask the same of the displacement over one second: the share of its errors within one
-and two of its deviations (68 % and 95 % are wanted). The last are the RMS of error over deviation.
+NEES is that of place, yaw and forward velocity by the deviations that a track carries, 5 degrees of freedom; ``inside``
+the share of rows between the 2.5 % and 97.5 % quantiles of chi-square, ``below`` that under the upper one. Without GNSS
+neither position nor yaw has anything to be compared with. The next columns ask the same of the displacement over one
+second: the share of its errors within one and two of its deviations (68 % and 95 % are wanted). The last are the RMS of
+error over deviation.
 
-``possible``: what no smoother can beat in forward velocity while the robot drives steadily, were every bias, scale and slip known. With
-white accelerometer noise of density q, velocities that measure with r_v and positions with r_p [unit² s], the error's variance is the
-integral of 1 / (w²/q + 1/r_v + 1/(r_p w²)) dw / 2 pi (Wiener's smoother). The vibration decides it: the case "quiet accelerometer" has the
-0.08 m/s² of a well damped unit in its place, all else being the same.
+``possible``: the smallest error of forward velocity that a smoother can reach at constant speed if every bias, scale
+and slip is known. With white accelerometer noise of density q, velocities that measure with r_v and positions with r_p
+[unit² s], the error's variance is the integral of 1 / (w²/q + 1/r_v + 1/(r_p w²)) dw / 2 pi (Wiener's smoother).
+Vibration dominates it: the case "quiet accelerometer" has 0.08 m/s², as a well damped unit has, and is otherwise the
+same.
 """
 
 from __future__ import annotations

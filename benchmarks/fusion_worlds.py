@@ -4,17 +4,20 @@
     python benchmarks/fusion_worlds.py --kinds "step" --seeds 1         # some, by a regular expression; clean always runs
     python benchmarks/fusion_worlds.py --compare A.json B.json          # two versions on the same worlds
 
-Each world is a drive of 150 to 240 s over gentle slopes at 0.5 to 3 m/s, in straight lines, arcs and stops. Its sensors (fixes, wheels,
-IMU, power, and a camera in every second world) become `Streams`, which go through the stages of ingest. A kind changes the sensors.
+Each world is a drive of 150 to 240 s over gentle slopes at 0.5 to 3 m/s, in straight lines, arcs and stops. Its sensors
+(fixes, wheels, IMU, power, and a camera in every second world) become `Streams`, which go through the stages of ingest.
+A kind changes the sensors.
 
-A flag is a quality bit that doubts the quantity: weak_gnss doubts only the place, bits about power only w and E; bits that describe
-the drive doubt nothing. The columns of a row, over all seeds; "–": no label without a flag, or nothing has to be named:
+A flag is a quality bit that doubts the quantity: weak_gnss doubts only the place, bits about power only w and E; bits
+that describe the drive doubt nothing. The columns of a row, over all seeds; "–": no label without a flag, or nothing
+has to be named:
 
-    labels; >3σ: per cent of labels whose T, w or E errs by more than 3σ without a flag; pos: the same of start points, beyond the circle
-    that holds 99.73 %; T, w, E: per cent inside 2σ, starts: per cent inside the 95 % circle, both without a flag; doubted: per cent of
-    good quantities (error below 2σ of the run without fault) that have a flag; lost: per cent of the labels of the run without fault
-    that are missing; length: track over truth, worst run; changes: changes, offsets and exclusions that tcpipe found, per run; named:
-    per cent of the runs where the fault matters whose first line of findings names it; CPU of the stages, per run.
+    labels; >3σ: per cent of labels whose T, w or E errs by more than 3σ without a flag; pos: the same of start points,
+    beyond the circle that holds 99.73 %; T, w, E: per cent inside 2σ, starts: per cent inside the 95 % circle, both
+    without a flag; doubted: per cent of good quantities (error below 2σ of the run without fault) that have a flag;
+    lost: per cent of the labels of the run without fault that are missing; length: track over truth, worst run;
+    changes: changes, offsets and exclusions that tcpipe found, per run; named: per cent of the runs where the fault
+    matters whose first line of findings names it; CPU of the stages, per run.
 """
 
 from __future__ import annotations
@@ -171,8 +174,8 @@ def make_world(seed: int, long_s: float) -> World:
 class Log:
     """Measurements by sensor, which kinds change in place; ``t`` are true times, ``stamp_s`` the times of its clock [s].
 
-    The robot's clock reads ``start_ns`` at 0 s, and ``shift_s`` more after ``split_s``, where ``is_epoch`` in another clock epoch. Labels
-    before ``judged_from_s`` are not judged.
+    The robot's clock reads ``start_ns`` at 0 s, and ``shift_s`` more after ``split_s``, where ``is_epoch`` in another
+    clock epoch. Labels before ``judged_from_s`` are not judged.
     """
 
     columns: dict[str, dict[str, Array]]

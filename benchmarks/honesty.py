@@ -7,14 +7,16 @@
     python benchmarks/honesty.py --read A.json                          # the table again
     python benchmarks/honesty.py --list                                 # all cells; those beyond the gate are indented
 
-A cell (`honesty_cells.py`) is a set of sensors under a fault; its drives last about four minutes. ``--cache`` keeps what the sensors
-recorded, so that another estimator, or another simulator, is judged on the same drives. Of the labels that no bit doubts a row shows
+A cell (`honesty_cells.py`) is a set of sensors under a fault; its drives last about four minutes. ``--cache`` keeps
+what the sensors recorded, so that another estimator, or another simulator, is judged on the same drives. Of the labels
+that no bit doubts a row shows
 
-    labels, per cent of T, v, w, E inside 1 and 2 sigma; per cent of start points inside DRMS and 1.73 DRMS (63 and 95 are wanted);
-    own: the same of T and E without the part of sigma that is common to a drive; c: the common error over its sigma, the largest;
-    median sigma over RMS error of T; per cent of good labels lost: of the labels that are good on the same drive without the fault, those
-    that are doubted or not there, though they are as good here; RMS errors of the track: position [mm], forward velocity [mm/s],
-    yaw [deg]; the track's length over the wheels' own; whether the finding is named; which other sensors are blamed; CPU [s] a drive.
+    labels, per cent of T, v, w, E inside 1 and 2 sigma; per cent of start points inside DRMS and 1.73 DRMS (63 and 95
+    are wanted); own: the same of T and E without the part of sigma that is common to a drive; c: the common error over
+    its sigma, the largest; median sigma over RMS error of T; per cent of good labels lost: of the labels that are good
+    on the same drive without the fault, those that are doubted or not there, though they are as good here; RMS errors
+    of the track: position [mm], forward velocity [mm/s], yaw [deg]; the track's length over the wheels' own; whether
+    the finding is named; which other sensors are blamed; CPU [s] a drive.
 
 Verdicts follow the limits that `LIMITS` holds.
 """
@@ -130,7 +132,8 @@ class Labels:
     def split(self, name: str) -> tuple[np.ndarray, float]:
         """Return absolute errors over standard deviations without what is common, of sure labels, and the common error over its own.
 
-        A current sensor has two common errors: a gain errs by a share of each label, an offset by the same power in all of them.
+        A current sensor has two common errors: a gain errs by a share of each label, an offset by the same power in all
+        of them.
         """
         error, claimed, common = (of[name][self.sure] for of in (self.error, self.claimed, self.common))
         known = np.isfinite(error) & np.isfinite(claimed)
@@ -179,7 +182,7 @@ def labels_of(outcome: Outcome, sensors: str) -> Labels:
 
 @dataclass
 class Figures:
-    """What a row shows, over the seeds of a cell."""
+    """Figures of a row, over the seeds of a cell."""
 
     cell: str
     clean: bool

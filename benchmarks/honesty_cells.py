@@ -1,8 +1,8 @@
 """Cells of `honesty.py`: families of errors that no estimator models exactly, their sizes, and the sets of sensors that they meet.
 
-A family is a function from a drive to an error; its numbers come from a random stream of the drive, named like the family. Every cell lies
-in an ordinary world: fixes whose error is correlated in time with an honest covariance, an antenna stated some centimetres off, and
-a current sensor with a gain and an offset.
+A family is a function from a drive to an error; its numbers come from a random stream of the drive, named like the
+family. Every cell lies in an ordinary world: fixes whose error is correlated in time with an honest covariance, an
+antenna stated some centimetres off, and a current sensor with a gain and an offset.
 """
 
 from __future__ import annotations
@@ -362,7 +362,7 @@ class HonestCell:
 
     @property
     def name(self) -> str:
-        """What ``--cells`` is matched with."""
+        """Text that ``--cells`` is matched with."""
         return f"{self.sensors}: {self.fault.name}"
 
     @property
@@ -390,7 +390,7 @@ class HonestCell:
 
 
 def _fault(name: str, role: str, said: str, readings: Callable[[Readings, Drive], Readings]) -> Fault:
-    """Return a fault of a sensor in an ordinary world; where ``said`` is empty nobody could name it."""
+    """Return a fault of a sensor in an ordinary world; with an empty ``said``, no check can name it."""
     fault = Fault(name, (role,), readings=readings)
     return replace(ORDINARY & fault, name=name, at_fault=fault.at_fault, said=said, route="valley")
 

@@ -5,8 +5,8 @@
     python benchmarks/label_accuracy.py --exact-gnss         # white noise of the fixes, and an antenna where the log states it
     python benchmarks/label_accuracy.py --recipe pipelines/husky-paper.toml
 
-Nothing of this is self-consistent: the truth comes from the simulator, which shares no formula with the pipeline but rotations.
-tests/end_to_end/test_whole_pipeline.py holds the same figures under limits.
+Nothing of this is self-consistent: the truth comes from the simulator, which shares no formula with the pipeline but
+rotations. tests/end_to_end/test_whole_pipeline.py holds the same figures under limits.
 """
 
 import argparse

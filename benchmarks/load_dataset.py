@@ -2,8 +2,9 @@
 
     python benchmarks/load_dataset.py DIRECTORY [SAMPLES]
 
-The directory keeps the map, the store and the datasets (`big_store`). Interleaved repeats in one process, CPU time; ratios are medians of
-those of each round. All files are in the page cache: a memmap then is a copy from memory, and its worth hangs on how it is used.
+The directory keeps the map, the store and the datasets (`big_store`). Interleaved repeats in one process, CPU time;
+ratios are medians of those of each round. All files are in the page cache: a memmap then is a copy from memory, and its
+worth hangs on how it is used.
 
 held open        one mapping for the whole epoch, a sample copied out of it at a time: no batch is made
 stacked          the same, and every 64 samples stacked to the batch that a trainer needs
@@ -76,7 +77,7 @@ def batched(path, order):
 
 
 class Mapped:
-    """What one writes for torch: a sample of a mapping and its label."""
+    """Usual dataset class for torch: it returns a sample of a mapping and its label."""
 
     def __init__(self, path, labels):
         self.stored, self.labels = np.load(path, mmap_mode="r"), labels

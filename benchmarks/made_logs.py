@@ -1,6 +1,7 @@
 """Logs for benchmarks: a drive of five navigation topics, with or without a camera, in every container.
 
-IMU 200 Hz, two odometries 50 Hz, power 20 Hz, GNSS 10 Hz, and raw images of 154 kB at 10 Hz: as in a real log, most bytes are the camera's.
+IMU 200 Hz, two odometries 50 Hz, power 20 Hz, GNSS 10 Hz, and raw images of 154 kB at 10 Hz: as in a real log, most
+bytes are the camera's.
 """
 
 import heapq

@@ -4,8 +4,9 @@
 
     python benchmarks/many_runs.py DIRECTORY [RUNS] [COMMAND...]     commands: status, ingest, new, build-dataset (default: all)
 
-Runs are synthetic: four segments on a small map, with the findings, sensors and topics of one short drive, so that documents have its size.
-Logs are files of eight bytes under the names, sizes and times that the store has seen. 10,000 take two CPU minutes, 100,000 need 12 GB.
+Runs are synthetic: four segments on a small map, with the findings, sensors and topics of one short drive, so that
+documents have its size. Logs are files of eight bytes under the names, sizes and times that the store has seen. 10,000
+take two CPU minutes, 100,000 need 12 GB.
 """
 
 import hashlib
@@ -43,7 +44,7 @@ DAY_NS = 86_400 * 10**9
 FIRST_NS = 10**18
 STEM = "drive_"
 SHARED = ("findings", "sensors", "topics", "notes", "distance_by_reason_m", "physics")
-"""What a synthetic run has of the drive that was ingested."""
+"""Parts of the ingested drive that a synthetic run keeps."""
 LIMITS = {"status": (1.2, None), "ingest": (None, None), "new": (2.2, 300), "build-dataset": (2.5, 300)}
 """CPU time [s] and memory [MB] of a command with 10,000 runs, where the index is there."""
 

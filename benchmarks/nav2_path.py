@@ -2,11 +2,12 @@
 
     python benchmarks/nav2_path.py [METRES] [PAIRS]
 
-A made site of METRES x METRES (default 160): waves of height with slopes to about 23 degrees, four classes, obstacles. `make_cost_map`
-writes its files; the map, its mask and its parameters are read as Nav2's map_server, its static layer of main and lyrical, and Smac 2D
-read them. Between PAIRS of ends (default 30) two paths are planned on the map: that of Smac 2D, on the eight courses of a grid without its
-smoother, and the best path of straight lines, which has the direction-free costs and no error of the grid. `compute_path_cost` predicts
-the energy of each, without turns, and that of `plan_path` over the directional costs.
+A made site of METRES x METRES (default 160): waves of height with slopes to about 23 degrees, four classes, obstacles.
+`make_cost_map` writes its files; the map, its mask and its parameters are read as Nav2's map_server, its static layer
+of main and lyrical, and Smac 2D read them. Between PAIRS of ends (default 30) two paths are planned on the map: that of
+Smac 2D, on the eight courses of a grid without its smoother, and the best path of straight lines, which has the
+direction-free costs and no error of the grid. `compute_path_cost` predicts the energy of each, without turns, and that
+of `plan_path` over the directional costs.
 """
 
 from __future__ import annotations

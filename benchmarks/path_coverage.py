@@ -1,13 +1,15 @@
 """How often 90 % intervals hold what further drives measure: metres, and paths of 10, 30 and 100 m; and models adapted to another payload.
 
-    python benchmarks/path_coverage.py [--train 6] [--metres 220] [--further 8] [--kind boosting] [--payload 0] [--seed 0] [--models 3]
+    python benchmarks/path_coverage.py [--train 6] [--metres 220] [--further 8] [--kind boosting] [--payload 0] [--seed
+    0] [--models 3]
 
-Drives wander over the small site of `tcpipe demo` with the paper's robot. All of it is the product's way: logs are simulated, ingested,
-built into a dataset, a model is trained on the first drives; the further ones, in a store of their own, are predicted on the map as
-`tcpipe evaluate --drive` does; all of it for --models seeds. Paths follow one another along a drive. Coverage is of the measured labels,
-over all drives, with its 95 % interval (binomial, clustered by drive: `tcpipe.cost.coverage`); 90 is to be inside. With --payload the
-further drives carry so many kg more. The line of budgets is of two consecutive paths of a drive together. The second table
-predicts the rest of each further drive of the last seed after its first metres adapt the model.
+Drives wander over the small site of `tcpipe demo` with the paper's robot. All of it is the product's way: logs are
+simulated, ingested, built into a dataset, a model is trained on the first drives; the further ones, in a store of their
+own, are predicted on the map as `tcpipe evaluate --drive` does; all of it for --models seeds. Paths follow one another
+along a drive. Coverage is of the measured labels, over all drives, with its 95 % interval (binomial, clustered by
+drive: `tcpipe.cost.coverage`); 90 is to be inside. With --payload the further drives carry so many kg more. The line of
+budgets is of two consecutive paths of a drive together. The second table predicts the rest of each further drive of the
+last seed after its first metres adapt the model.
 """
 
 from __future__ import annotations

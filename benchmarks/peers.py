@@ -1,18 +1,20 @@
 """tcpipe beside another estimator on the same drives: ``python benchmarks/peers.py [--seeds 2] [--only REGEX]``.
 
-The peer is pyins (PyPI: python-ins), a filter for inertial navigation with error states; ``make compare-peers`` installs it. Without it the
-program says so and compares the rest. Drives are those of `campaign_drives.py` over a valley, with fixes, IMU and wheels. They have no
-outliers, no wrong stamps and no unstated antenna, since the peer models none of them. Noise of fixes is white, or correlated in time by
-exp(-t / 10 s); its covariance is stated. In the middle half of the drive there are no fixes for a minute.
+The peer is pyins (PyPI: python-ins), a filter for inertial navigation with error states; ``make compare-peers``
+installs it. Without it the program says so and compares the rest. Drives are those of `campaign_drives.py` over a
+valley, with fixes, IMU and wheels. They have no outliers, no wrong stamps and no unstated antenna, since the peer
+models none of them. Noise of fixes is white, or correlated in time by exp(-t / 10 s); its covariance is stated. In the
+middle half of the drive there are no fixes for a minute.
 
-All estimators get what `tcpipe.stages.read` made of the log. The peer starts at the true course after the first metres, with the noise of
-the simulated IMU; its wheels have a scale by the distance between fixes, are averaged to 10 Hz and moved to the IMU. It filters forward
-only, while tcpipe smooths. ``simplest``: fixes interpolated and differenced over a second, yaw from their course; without fixes the wheels
-with that scale, and the gyroscope less its mean at rest.
+All estimators get what `tcpipe.stages.read` made of the log. The peer starts at the true course after the first metres,
+with the noise of the simulated IMU; its wheels have a scale by the distance between fixes, are averaged to 10 Hz and
+moved to the IMU. It filters forward only, while tcpipe smooths. ``simplest``: fixes interpolated and differenced over a
+second, yaw from their course; without fixes the wheels with that scale, and the gyroscope less its mean at rest.
 
-A row shows RMS errors of position (horizontal, base_link) [mm], forward velocity [mm/s] and yaw [deg] outside the outage; the share of the
-position's errors, east and north, inside 1 and 2 of the stated standard deviations; RMS error within the outage [mm] and the share of its
-errors inside 2; CPU seconds for an hour of log. Rows of the track within ten seconds of either end count for none.
+A row shows RMS errors of position (horizontal, base_link) [mm], forward velocity [mm/s] and yaw [deg] outside the
+outage; the share of the position's errors, east and north, inside 1 and 2 of the stated standard deviations; RMS error
+within the outage [mm] and the share of its errors inside 2; CPU seconds for an hour of log. Rows of the track within
+ten seconds of either end count for none.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ _EARTH_M = 6_371_000.0
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a drive's sensors measured, on one clock [s] and in base_link's axes (x forward, y left, z up)."""
+    """Measurements of a drive's sensors, on one clock [s] and in the axes of base_link (x forward, y left, z up)."""
 
     streams: Streams
     fix_s: np.ndarray
@@ -166,7 +168,7 @@ def run_tcpipe(given: Inputs) -> Estimate:
 
 
 def run_simplest(given: Inputs) -> Estimate:
-    """Difference fixes; reckon from the last one where there are none for two seconds."""
+    """Difference fixes; dead-reckon from the last one during gaps of more than two seconds."""
     begun_s = time.process_time()
     at_s, half_s = given.track_s, 0.5
     antenna_m, before_m, after_m = (

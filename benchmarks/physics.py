@@ -32,7 +32,7 @@ NAMES = {4: "grass", 5: "mud", 6: "unpaved", 7: "paved"}
 
 
 def plain_robot(*, half_radius_m: float = math.inf) -> SimulatedRobot:
-    """Return a robot without slip that loses 45 N in its drivetrain, whose torque on curves is the same at every radius unless told."""
+    """Return a robot without slip that loses 45 N in its drivetrain; by default its torque on curves is the same at every radius."""
     usual = SimulatedRobot()
     ground = {name: replace(of, slip=0.0) for name, of in usual.ground.items()}
     return replace(usual, ground=ground, slope_slip=0.0, scrub_half_radius_m=half_radius_m, drivetrain_loss_newton=45.0)

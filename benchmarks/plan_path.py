@@ -2,11 +2,12 @@
 
     python benchmarks/plan_path.py [CELLS] [PAIRS]
 
-A made site of CELLS x CELLS cells of 1 m (default 300; 1000 takes minutes and 5 GB for the explicit graph): waves of height, four classes,
-obstacles. The costs of all cells are known, as from a cost map. The explicit graph has a node for each cell and course; scipy's Dijkstra
-searches it. Each of the two runs in its own process, so that its peak memory is its own; the memory of the site is subtracted from
-both (what is left is at least 0.1 MB). Costs are compared for PAIRS of ends (default 3). The last line compares the energy of the three
-plans of each pair, as `tcpipe predict-path` judges it.
+A made site of CELLS x CELLS cells of 1 m (default 300; 1000 takes minutes and 5 GB for the explicit graph): waves of
+height, four classes, obstacles. The costs of all cells are known, as from a cost map. The explicit graph has a node for
+each cell and course; scipy's Dijkstra searches it. Each of the two runs in its own process, so that its peak memory is
+its own; the memory of the site is subtracted from both (what is left is at least 0.1 MB). Costs are compared for PAIRS
+of ends (default 3). The last line compares the energy of the three plans of each pair, as `tcpipe predict-path` judges
+it.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """Reading a log into tables: CPU time against rosbags, rerun and the mere reading and decompressing of the chunks ("floor").
 
-Run by hand: ``python benchmarks/read_logs.py [--quick | --minutes M] [--rerun PYTHON] [--huge GB] [--only PART]``.
-Logs are made in a temporary directory; reads alternate in one process, the least of some times counts; what is read is compared
-before anything is timed. ``--quick`` takes logs of one minute instead of ten: all is done in some two minutes on an idle machine, but
-what is paid once a log weighs more. ``--rerun`` names the Python of an environment in which rerun-sdk is installed; without it those
-lines say so. ``--huge`` adds the memory that reading a log of so many GB takes, which needs as much room on the disk.
+Run by hand: ``python benchmarks/read_logs.py [--quick | --minutes M] [--rerun PYTHON] [--huge GB] [--only PART]``. Logs
+are made in a temporary directory; reads alternate in one process, the least of some times counts; what is read is
+compared before anything is timed. ``--quick`` takes logs of one minute instead of ten: all is done in some two minutes
+on an idle machine, but what is paid once a log weighs more. ``--rerun`` names the Python of an environment in which
+rerun-sdk is installed; without it those lines say so. ``--huge`` adds the memory that reading a log of so many GB
+takes, which needs as much room on the disk.
 """
 
 import argparse
@@ -132,7 +133,7 @@ def assert_equal_tables(path: Path, other: Path | None = None) -> None:
 
 
 class Machine:
-    """Who else may run while something is timed: by default all, with ``alone`` nobody (Linux; needs the right to it)."""
+    """Let other processes run while something is timed, or with ``alone`` none (Linux; needs the privilege)."""
 
     def __init__(self) -> None:
         self.alone = False

@@ -1,22 +1,23 @@
-"""What can be predicted of real drives where there is no map: time and energy of a metre from slope, turn and speed alone.
+"""Measure how well slope, turn and speed alone predict time and energy of a metre of real drives without a map.
 
     python benchmarks/real_data.py DRIVE=LOG[,RECIPE] [DRIVE=LOG[,RECIPE] ...]
     python benchmarks/real_data.py --classes STORE
 
-Logs are ingested; the class of the ground is not known. Fitted are the mean of the other metres, their mean power at the speed, physics
-(`cost/physics.py`; the speed by a line over the slope, of the commanded speed), and boosted trees on slope, turn and commanded speed.
-Where no speed is commanded, the track's own stands for it: E is then that of a metre whose speed is known, and T is not predicted; beside
-that E and T without the speed. Held out are, in turn, fifths of the drive and, between two drives, the whole other drive; the mean of the
-held-out block itself, which no model knows, stands beside. R² is one less the squared errors over those of the mean of all metres. 90 %
-intervals, NLL and CRPS come from a second cross-fit inside what is fitted on, so that nothing held out has told them. The floor is what the
-labels' own deviations make of a perfect prediction.
+Logs are ingested; the class of the ground is not known. Fitted are the mean of the other metres, their mean power at
+the speed, physics (`cost/physics.py`; the speed by a line over the slope, of the commanded speed), and boosted trees on
+slope, turn and commanded speed. Without a commanded speed the speed of the track is used: E is then that of a metre
+whose speed is known, and T is not predicted; E and T without the speed are printed as well. Each fifth of the drive is
+held out in turn and, between two drives, the whole other drive. The mean of the held-out block itself, which no model
+knows, is printed for comparison. R² is one less the squared errors over those of the mean of all metres. 90 %
+intervals, NLL and CRPS come from a second cross-fit inside the fitted part, so that they do not depend on held-out
+data. The floor is the error of a perfect prediction, given the standard deviations of the labels.
 
-Between two drives a second table shows physics and trees of the other drive after the first K metres of this one adapt them
-(`tcpipe.cost.adaptation`), on the metres after the largest K, beside the mean of these K metres.
+Between two drives a second table shows physics and trees of the other drive after the first K metres of this one adapt
+them (`tcpipe.cost.adaptation`), on the metres after the largest K, beside the mean of these K metres.
 
-With ``--classes`` the energy per metre of a store's runs by the class of their ground, which is the first word of their names: does the
-class tell the cost? Runs are the unit: the mean over runs, the deviation between them, and how well the mean of the other runs of a class
-predicts a run's, beside the mean of all other runs.
+``--classes`` prints the energy per metre of a store's runs by the class of their ground, which is the first word of
+their names. Runs are the unit: the mean over runs, the standard deviation between them, and the error of the mean of
+the other runs of a class as a prediction of a run, compared with the mean of all other runs.
 """
 
 from __future__ import annotations
@@ -155,14 +156,14 @@ def _folds(count: int) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class Told:
-    """What a predictor says of held-out metres, centred, and what it states of its errors."""
+    """Centred predictions of held-out metres, and the stated errors."""
 
     said: dict[str, Floats]
     spread: dict[str, Spread]
 
 
 def told(fit: Callable[[Metre], Predictor], known: Metre, there: Metre) -> Told:
-    """Fit to some metres and predict others; what errors are like is told by folds of the first."""
+    """Fit to some metres and predict others; folds of the first give the distribution of errors."""
     said, found = centred(fit, known, there)
     nowhere = np.zeros(len(there.power), np.int64)
     spread = {
@@ -287,11 +288,11 @@ def floor_lines(name: str, of: Metre) -> Iterator[str]:
 
 
 LEAST_METRES = 3
-"""Of a run, so that its mean counts."""
+"""Fewest metres of a run whose mean counts [1]."""
 
 
 def class_lines(store: Path) -> Iterator[str]:
-    """Yield the energy per metre by the class of the ground, and what the class tells of it."""
+    """Yield the energy per metre by the class of the ground, and how well the class predicts it."""
     runs: dict[str, list[Floats]] = {}
     for run in Store(store).runs():
         found = run.segments()

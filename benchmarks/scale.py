@@ -1,10 +1,10 @@
-"""What hours of driving cost as there are more of them, and what the measured figures say of 100,000 hours and 10⁹ samples.
+"""Measure the cost of more hours of driving, and extrapolate to 100,000 hours and 10⁹ samples.
 
     python benchmarks/scale.py hours DIRECTORY [HOURS] [JOBS] [SCENARIO]   write that many hours of logs, and ingest them by one call
     python benchmarks/scale.py memory LOG [LOG ...]              the most memory that ingesting each log takes, and its CPU
     python benchmarks/scale.py paper                             what follows from the table of docs/internals/performance.md
 
-One simulated drive of twelve minutes (or that of another scenario) is repeated, each time later, every measurement with noise of its own.
+One simulated drive of twelve minutes (or that of another scenario) is repeated at later times with new noise.
 CPU is that of the process and its workers, memory the largest of the calling process at any time.
 """
 
@@ -39,7 +39,7 @@ LOGS_PER_HOUR = 5
 NAME = "drive_{:04d}.mcap"
 MOST_HZ = 50
 SMALL = 1e-4
-"""Of a value's spread: makes another measurement of it, and no other drive."""
+"""Noise of a repeated value over its spread [1]: another measurement of the same drive."""
 
 
 def write_logs(directory: Path, hours: int, scenario: str) -> list[Path]:

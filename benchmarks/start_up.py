@@ -1,12 +1,13 @@
-"""What a command costs before it does anything, and what a second worker gains.
+"""Measure the start-up cost of a command, and the gain by a second worker.
 
-Run by hand, on idle cores: ``python benchmarks/start_up.py [--quick]``. Each line is CPU time of a process (and of what it starts) beside
-that of ``import numpy, pyarrow, numba`` in the same run, the least of some times: the floor that nothing can go below. ``kernel`` is that
-floor with one cached kernel called, for which numba loads much more. ``ingest`` is a process that ingests half a minute of driving twice,
-less twice what the second time takes: what comes before and beside the stages. Bytecode is kept, as installations do. The last lines are
-wall times of two logs of an hour of driving, the least of some turns: with one worker against two, by two processes that are started at
-once, which is what two cores of this machine can do, and by two workers of a Dask cluster, which were there before; ``--quick`` leaves them
-out.
+Run by hand, on idle cores: ``python benchmarks/start_up.py [--quick]``. Each line is CPU time of a process (and of what
+it starts) beside that of ``import numpy, pyarrow, numba`` in the same run, the least of some times: the floor that
+nothing can go below. ``kernel`` is that floor with one cached kernel called, for which numba loads much more.
+``ingest`` is a process that ingests half a minute of driving twice, less twice what the second time takes: what comes
+before and beside the stages. Bytecode is kept, as installations do. The last lines are wall times of two logs of an
+hour of driving, the least of some turns: with one worker against two, by two processes that are started at once, which
+is what two cores of this machine can do, and by two workers of a Dask cluster, which were there before; ``--quick``
+leaves them out.
 """
 
 from __future__ import annotations

@@ -7,15 +7,16 @@ Run it before and after a refactoring, each time at that commit and with a direc
     python benchmarks/table_digests.py compare before.json after.json
     python benchmarks/table_digests.py compare before.json after.json --renamed velocity=speed --renamed track/old=new
 
-`write` simulates drives with many sets of sensors and one or more for each fault. It ingests them and the third-party logs below
-$TCPIPE_TEST_DATA that `digest_runs.py` lists, builds four datasets, and writes a digest of each column of each table; this takes four
-minutes of CPU. The digest covers the type, the validity and the values of a column. It ignores chunks, dictionaries and compression. An
-entry has the exit status too, which is all that a log gives that fails. `--logs BEFORE` takes the simulated logs of an earlier call; use
-it if the change alters the simulator. Use the same machine and libraries for both calls, since processors differ in the last digits.
+`write` simulates drives with many sets of sensors and one or more for each fault. It ingests them and the third-party
+logs below $TCPIPE_TEST_DATA that `digest_runs.py` lists, builds four datasets, and writes a digest of each column of
+each table; this takes four minutes of CPU. The digest covers the type, the validity and the values of a column. It
+ignores chunks, dictionaries and compression. An entry has the exit status too, which is all that a log gives that
+fails. `--logs BEFORE` takes the simulated logs of an earlier call; use it if the change alters the simulator. Use the
+same machine and libraries for both calls, since processors differ in the last digits.
 
-`compare` prints what differs or is missing, by table and column, with the names of the runs. It exits with 1 if anything does.
-`--renamed` and `--ignore` take the name of a column, a patch array or a table, or one column of one table as TABLE/COLUMN. TABLE is the
-name before the change for `--renamed`, and the name after it for `--ignore`.
+`compare` prints what differs or is missing, by table and column, with the names of the runs. It exits with 1 if
+anything does. `--renamed` and `--ignore` take the name of a column, a patch array or a table, or one column of one
+table as TABLE/COLUMN. TABLE is the name before the change for `--renamed`, and the name after it for `--ignore`.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ import tcpipe
 DATA = Path(os.environ.get("TCPIPE_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
 PROGRAM = Path(tcpipe.__file__).parents[1]
 IN_DATASETS = 6
-"""So many of the first logs share a store, from which the datasets are built."""
+"""Number of logs, from the first, that share the store from which datasets are built."""
 RECIPES = {
     "ukf": '[fuse]\nestimator = "ukf"',
     "fused": '[label]\nvelocity = "fused"\nintegration = "right_endpoint"',

@@ -2,7 +2,8 @@
 
     python benchmarks/table_model.py [SAMPLES]
 
-Patches are noise, labels depend on four features of sixteen and noise: as many trees and leaves as real ones have. SAMPLES is 10,000.
+Patches are noise, labels depend on four features of sixteen and noise: as many trees and leaves as real ones have.
+SAMPLES is 10,000.
 """
 
 from __future__ import annotations

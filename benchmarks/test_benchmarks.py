@@ -32,7 +32,8 @@ LONGEST_S = 600
 class Smallest:
     """The arguments of a program's smallest size, and what its output holds.
 
-    ``{out}`` is a new directory, ``{log}`` a simulated log of some minutes, ``{dataset}`` a dataset of it, ``{bucket}`` a bucket's URL.
+    ``{out}`` is a new directory, ``{log}`` a simulated log of some minutes, ``{dataset}`` a dataset of it, ``{bucket}``
+    a bucket's URL.
     """
 
     arguments: str

@@ -38,7 +38,7 @@ def test_labels_of_a_clean_log_are_true_and_not_doubted(clean):
 
 @pytest.mark.parametrize("name", ["metres, none claimed", "IMU pitched by 5 deg", "wrong fix"])
 def test_no_label_is_sure_and_wrong(name, clean):
-    """Of the labels that no bit doubts, few lie beyond two deviations."""
+    """Few labels without a flag are off by more than two standard deviations."""
     found = figures(Cell("all", 10.0, FAULTS[name]), clean)
     assert not found.traces
     for label in LABELS:

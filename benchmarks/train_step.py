@@ -2,8 +2,9 @@
 
     OMP_NUM_THREADS=1 python benchmarks/train_step.py DATASET [WIDTH]
 
-Prints the least microseconds a sample of batching (shuffled, mirrored, formed), of one training step as `tcpipe train` does it, and of a
-forward pass; and the throughput of both first as a share of that of a loop of a few lines on ready tensors, which alternates with them.
+Prints the least microseconds a sample of batching (shuffled, mirrored, formed), of one training step as `tcpipe train`
+does it, and of a forward pass; and the throughput of both first as a share of that of a loop of a few lines on ready
+tensors, which alternates with them.
 """
 
 from __future__ import annotations

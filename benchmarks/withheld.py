@@ -3,13 +3,16 @@
     python benchmarks/withheld.py [LOGS] [--only NAME] [--log LOG ...]
 
 For each log `tcpipe audit` withholds fixes in windows of 10, 30 and 60 s; see `tcpipe/pipeline/audit.py`. One row a log
-shows the fixes: windows, median error, 95 % error and σ [m], and the share of errors inside 1σ and 2σ. Pooled figures follow, one value a
-second of every window, and the mean of the logs' shares: wanted are 92 % of withheld fixes inside 2σ. Logs without fixes show the length of
-the track over that of their own odometry: wanted is 1 to within 2 %. Husky logs are audited again without GNSS, and without GNSS and IMU.
+shows the fixes: windows, median error, 95 % error and σ [m], and the share of errors inside 1σ and 2σ. Pooled figures
+follow, one value a second of every window, and the mean of the logs' shares: wanted are 92 % of withheld fixes inside
+2σ. Logs without fixes show the length of the track over that of their own odometry: wanted is 1 to within 2 %. Husky
+logs are audited again without GNSS, and without GNSS and IMU.
 
-A hash of a log's name puts half of the logs aside (``held out``): their figures are printed apart, and nothing may be tuned on them.
+A hash of a log's name puts half of the logs aside (``held out``): their figures are printed apart, and nothing may be
+tuned on them.
 
-LOGS, or the environment's TCPIPE_PUBLIC_LOGS, is a directory with files of public repositories, of which none belongs here:
+LOGS, or the environment's TCPIPE_PUBLIC_LOGS, is a directory with files of public repositories, of which none belongs
+here:
 
 - ``husky/*.bag``: kaasmandje/ResearchMethods2023, branch Original-data
 - ``evo/nav2_turtlebot.mcap``: MichaelGrupp/evo, test/data
@@ -17,9 +20,11 @@ LOGS, or the environment's TCPIPE_PUBLIC_LOGS, is a directory with files of publ
 - ``fomo/``: norlab-ulaval/fomo-sdk, gt.txt and odom.csv of examples/data/2025-10-14/red_2025-10-14-11-41
 - ``giow/``: i2Nav-WHU/GIOW-release, GNSS_data.txt and odometer_speed.txt of data
 - ``librsf/``: TUC-ProAut/libRSF, Corridor, Lecture_Hall and Indoor_UWB of datasets, each _GT.txt and _Input.txt
-- ``fau/``: dylans019/CAP6415_F25_project-…, EnergyConsumptionPredictionFiles/data/test_dataset/test_gps_20251118_162921.csv
+- ``fau/``: dylans019/CAP6415_F25_project-…,
+EnergyConsumptionPredictionFiles/data/test_dataset/test_gps_20251118_162921.csv
 
-TCPIPE_TEST_DATA names the directory with ``robot_localization/`` and ``warthog_grass_a/``. A log that is not there is named and skipped.
+TCPIPE_TEST_DATA names the directory with ``robot_localization/`` and ``warthog_grass_a/``. A log that is not there is
+named and skipped.
 """
 
 from __future__ import annotations
@@ -96,7 +101,7 @@ class Case:
     path: Path
     recipe: str = ""
     convert: Callable[[Path, Path], None] | None = None
-    """Writes the tables of a log that is none into a directory."""
+    """Function that writes the tables of a log without a log file into a directory."""
 
     @property
     def half(self) -> str:
@@ -133,7 +138,7 @@ def _write(path: Path, header: str, *columns: np.ndarray) -> None:
 
 
 def list_cases(logs: Path, data: Path) -> Iterator[Case]:
-    """Yield every log; those of which only a directory is known are those that lie in it."""
+    """Yield every log; a directory stands for all logs in it."""
     husky = sorted((logs / "husky").glob("*.bag")) or [logs / "husky" / "*.bag"]
     for variant, topics in HUSKY_VARIANTS.items():
         yield from (Case(f"husky/{path.stem}{variant}", path, f"[read.topics]\n{HUSKY}{topics}") for path in husky)
@@ -155,7 +160,7 @@ def list_cases(logs: Path, data: Path) -> Iterator[Case]:
 
 @dataclass
 class Half:
-    """What the logs of one half showed."""
+    """Results of the logs of one half."""
 
     comparisons: dict[float, list[Comparison]] = field(default_factory=lambda: defaultdict(list))
     ratios: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))

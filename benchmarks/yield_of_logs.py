@@ -1,8 +1,8 @@
-"""What real logs yield, from the way driven to the metres that become samples.
+"""Print the yield of real logs, from the distance driven to the metres that become samples.
 
     python benchmarks/yield_of_logs.py LOG... [--robot NAME]
 
-There is no truth beside them: the wheels' own way stands beside the track's, and what ingest said below.
+There is no truth: the distance by the wheels is printed next to that of the track, then the messages of ingest.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LABELLED_SEGMENTS, MASKED_TRACK, REJECTIONS, SAMPLES, STREAMS
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-"""Of every schema in ``schemas/``."""
+"""Contract of every schema in ``schemas/``."""
 DEFINITIONS = "defs"
 """The schema whose definitions all documents and answers refer to."""
 DOCUMENTS = {"run": Run, "dataset": DatasetCard}

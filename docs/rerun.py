@@ -2,11 +2,12 @@
 
     python docs/rerun.py docs/tutorials/first-dataset.md docs/how-to/damaged-logs.md
 
-Blocks fenced as ``console`` hold commands after ``$ ``, blocks fenced as ``pycon`` Python after ``>>> ``; the rest of such a block is
-output and is replaced. A block fenced as ``toml`` that begins with ``# tcpipe.toml`` is added to that file. Each page runs in a directory
-of its own below ~: the NAME of its line ``mkdir NAME && cd NAME``, or what the page is called. A page that goes on from another, by
-``../NAME/``, finds that one followed; ``../docs/`` is this directory. ``$DATA`` is the directory of third-party files (TCPIPE_TEST_DATA).
-tests/end_to_end/test_docs.py runs the pages the same way and compares, numbers aside.
+Blocks fenced as ``console`` hold commands after ``$ ``, blocks fenced as ``pycon`` Python after ``>>> ``; the rest of
+such a block is output and is replaced. A block fenced as ``toml`` that begins with ``# tcpipe.toml`` is added to that
+file. Each page runs in a directory of its own below ~: the NAME of its line ``mkdir NAME && cd NAME``, or what the page
+is called. A page that goes on from another, by ``../NAME/``, finds that one followed; ``../docs/`` is this directory.
+``$DATA`` is the directory of third-party files (TCPIPE_TEST_DATA). tests/end_to_end/test_docs.py runs the pages the
+same way and compares, numbers aside.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def rerun(page: Path, directory: Path) -> str:
 def find_inputs(body: str, prompt: str, continues: Callable[[str, str], bool]) -> list[str]:
     """Return the inputs of a block, each with its further lines, without outputs.
 
-    ``continues(line_before, line)`` tells whether a line belongs to the input before it.
+    ``continues(line_before, line)`` returns whether a line belongs to the input before it.
     """
     inputs: list[list[str]] = []
     inside = False

@@ -19,7 +19,7 @@ _PLACE = """([name, x, y]) => {
   const view = page.plots.find((one) => one.model.name === name), box = view.canvas_view.el.getBoundingClientRect();
   return [box.left + view.frame.x_scale.compute(x), box.top + view.frame.y_scale.compute(y)];
 }"""
-"""Where a point of a plot lies in the window."""
+"""Position of a point of a plot in the window [px]."""
 
 
 class Recorder:
@@ -97,7 +97,7 @@ class Recorder:
             self.hold(90)
 
     def find_place(self, plot: str, x: float, y: float) -> tuple[float, float]:
-        """Return where a point of a plot lies in the window."""
+        """Return the position of a point of a plot in the window [px]."""
         return tuple(self.tab.evaluate(_PLACE, [plot, x, y]))
 
     def save(self, path: Path) -> None:

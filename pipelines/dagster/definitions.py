@@ -1,8 +1,8 @@
 """tcpipe under Dagster: ``dagster dev -f pipelines/dagster/definitions.py``.
 
-Each log is a partition that a sensor finds; the assets are ``run`` (of one log), ``dataset`` and ``model``. The definitions call tcpipe's
-commands and read what they print with ``--json``: figures become metadata, findings become asset checks. The environment states where
-everything is:
+Each log is a partition that a sensor finds; the assets are ``run`` (of one log), ``dataset`` and ``model``. The
+definitions call tcpipe's commands and read what they print with ``--json``: figures become metadata, findings become
+asset checks. The environment states where everything is:
 
     TCPIPE_LOGS      folder or URL of the recordings (default: recordings)
     TCPIPE_STORE     store with the maps (tcpipe-store)
@@ -42,13 +42,13 @@ _UNFINISHED = [
     dg.DagsterRunStatus.CANCELING,
 ]
 _RETRIES = dg.RetryPolicy(max_retries=3, delay=600, backoff=dg.Backoff.EXPONENTIAL, jitter=dg.Jitter.PLUS_MINUS)
-"""Of failures that may pass: a full disk, a network. The others end a run at once."""
+"""Retries of failures that may pass, such as a full disk or a network. Other failures end a run at once."""
 _ASSET_SETTINGS: dict[str, Any] = {"retry_policy": _RETRIES, "code_version": tcpipe.__version__, "group_name": "tcpipe"}
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command printed."""
+    """Output of a command."""
 
     result: Mapping[str, Any]
     """The last JSON object."""
@@ -125,7 +125,7 @@ def _format_distances(distance_by_reason_m: Mapping[str, float]) -> dg.MetadataV
 
 
 def _read_picture(path: Path) -> dict[str, dg.MetadataValue]:
-    """Return a PNG as metadata that the page shows; nothing if there is none."""
+    """Return a PNG as metadata for the page of the run; nothing if there is no picture."""
     if not path.is_file():
         return {}
     data = base64.b64encode(path.read_bytes()).decode()
