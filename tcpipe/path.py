@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.geometry.polyline import Polyline
 
 _LEAST_M = 1e-3
@@ -33,10 +33,10 @@ class Cut:
     curved_ns, leftover_ns : [ns], shape (C, 2) and (L, 2), int64: begin and end of every other piece; the three kinds tile the stretch.
     """
 
-    start_ns: NDArray[np.int64]
-    end_ns: NDArray[np.int64]
-    curved_ns: NDArray[np.int64]
-    leftover_ns: NDArray[np.int64]
+    start_ns: Ints
+    end_ns: Ints
+    curved_ns: Ints
+    leftover_ns: Ints
 
     def ledger(self, path: Polyline) -> dict[str, tuple[float, float]]:
         """Return horizontal metres and seconds of the three kinds by name; together they are the stretch's."""
@@ -82,7 +82,7 @@ def cut_by_chord(path: Polyline, *, chord_m: float, max_arc_to_chord: float) -> 
     return Cut(spans[:, 0], spans[:, 1], _find_spans(curved), _find_spans([(start, last)] if start < last else []))
 
 
-def _find_spans(pairs: list[tuple[int, int]]) -> NDArray[np.int64]:
+def _find_spans(pairs: list[tuple[int, int]]) -> Ints:
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 

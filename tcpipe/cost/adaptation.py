@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import stdtrit
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Mask
 from tcpipe.cost.prediction_errors import COVERAGE, NORMAL_HALF_WIDTH, QuantityErrors, SumDistribution
 
 _CHANGES = {0.0: 0.7, 0.1: 0.15, 0.3: 0.15}
@@ -52,16 +52,16 @@ class Metres:
     """Over each, both ways counted."""
     stated_std: Floats | None = None
     """Standard deviation that the model states; None: the usual one."""
-    is_near: NDArray[np.bool_] | None = None
+    is_near: Mask | None = None
     """Whether each is near training ground; None: none is."""
 
-    def take(self, rows: NDArray[np.bool_]) -> Metres:
+    def take(self, rows: Mask) -> Metres:
         """Return some of them."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return replace(self, **{name: value[rows] for name, value in values.items() if value is not None})
 
     @property
-    def ground(self) -> tuple[Floats, NDArray[np.integer], Floats | None, NDArray[np.bool_] | None]:
+    def ground(self) -> tuple[Floats, NDArray[np.integer], Floats | None, Mask | None]:
         """Return the arguments of the methods of `QuantityErrors`."""
         return self.predicted, self.class_id, self.stated_std, self.is_near
 

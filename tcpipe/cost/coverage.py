@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaincinv, stdtrit
 
+from tcpipe.arrays import Mask
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
@@ -36,7 +37,7 @@ _FEWEST_RUNS = 5
 """Runs without which a coverage has no interval: two or three do not show how runs differ."""
 
 
-def measure_coverage(is_inside: NDArray[np.bool_], runs: NDArray[np.generic]) -> Coverage:
+def measure_coverage(is_inside: Mask, runs: NDArray[np.generic]) -> Coverage:
     """Return the share of samples that are inside, and its binomial interval, clustered by run.
 
     Samples of one run err alike, so that they count as fewer: as many as have the variance that the runs show, less for the few degrees of

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.power.noise import compute_median_period_s
 from tcpipe.power.rails import Rail, SampledSignal, is_power_only
 from tcpipe.tables.bits import Quality
@@ -157,9 +157,7 @@ def subtract_idle_power(
     return {name: np.where(known, value, np.nan) for name, value in values.items()}
 
 
-def estimate_energy_budget(
-    energy_joule: NDArray[np.float64], variance_j2: Mapping[str, NDArray[np.float64]]
-) -> EnergyBudget | None:
+def estimate_energy_budget(energy_joule: Floats, variance_j2: Mapping[str, Floats]) -> EnergyBudget | None:
     """Return the noise floor of E, shape (M,) [J], NaN without a label; None without energies.
 
     ``variance_j2`` has variances, shape (M,) [J²], of the `CAUSES`, which are independent and add up, and of other keys of the budget.
@@ -205,7 +203,7 @@ _VOLTAGE_SHARE = 0.02
 _RATE_TOLERANCE = 0.98  # a 10 Hz source is 10 Hz though its stamps jitter
 
 
-def combine_flags(flags: dict[Quality, NDArray[np.bool_]], count: int) -> NDArray[np.uint32]:
+def combine_flags(flags: dict[Quality, Mask], count: int) -> NDArray[np.uint32]:
     """Return the flags of ``count`` segments as bits, shape (M,)."""
     quality = np.zeros(count, dtype=np.uint32)
     for bit, flagged in flags.items():
@@ -243,8 +241,8 @@ def _is_varying(voltage: SampledSignal) -> bool:
 
 
 def touches_voltage_outside(
-    rails: list[Rail], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64], *, range_volt: tuple[float, float] | None
-) -> NDArray[np.bool_]:
+    rails: list[Rail], start_ns: Ints, end_ns: Ints, *, range_volt: tuple[float, float] | None
+) -> Mask:
     """Return the spans that touch a voltage sample outside the range [V], shape (M,); none without a range."""
     outside = np.zeros(len(start_ns), dtype=np.bool_)
     low, high = range_volt or (-np.inf, np.inf)
@@ -256,7 +254,7 @@ def touches_voltage_outside(
     return outside
 
 
-def spans_near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: float) -> NDArray[np.bool_]:
+def spans_near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: float) -> Mask:
     """Return which spans of path length [m], shape (M,), have one of the positions [m], shape (G,), inside or nearer than ``within_m``."""
     ordered = np.sort(position_m)
     first = np.searchsorted(ordered, start_m - within_m, side="left")
@@ -264,7 +262,7 @@ def spans_near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: 
     return last > first
 
 
-def has_slip(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> NDArray[np.bool_]:
+def has_slip(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> Mask:
     """Return where wheel and body speed differ by more than a share of the wheel speed, shape (M,); not where it is unknown.
 
     Both are means over the segment along the body's x axis [m/s]: along the slope, not horizontal.
@@ -272,6 +270,6 @@ def has_slip(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> ND
     return np.abs(wheel_mps - ground_mps) > above * np.abs(wheel_mps)
 
 
-def has_mean_mismatch(mean_watt: Floats, power_watt: Floats, *, above: float = 0.05) -> NDArray[np.bool_]:
+def has_mean_mismatch(mean_watt: Floats, power_watt: Floats, *, above: float = 0.05) -> Mask:
     """Return where the plain mean of the power samples is off the time-weighted mean by more than a share of it; not where unknown."""
     return np.abs(mean_watt - power_watt) > above * np.abs(power_watt)

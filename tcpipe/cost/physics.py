@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.robust import estimate_robust_std, solve_non_negative
 from tcpipe.tables.facts import PhysicsFit, PhysicsScore, PhysicsTerm
 
@@ -78,7 +78,7 @@ class FitSamples:
     mean_abs_yaw_rate_radps: Floats
     terrain: NDArray[np.str_]
 
-    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> FitSamples:
+    def take(self, rows: Ints | Mask) -> FitSamples:
         """Return some of them."""
         return FitSamples(*(getattr(self, name)[rows] for name in self.__slots__))
 
@@ -120,7 +120,7 @@ class Physics:
         slope = np.array([1.0 / grade, -rolling / grade**2])
         return rolling / grade, float(np.sqrt(slope @ self.covariance[np.ix_(places, places)] @ slope))
 
-    def is_driven(self, metres: FitSamples) -> NDArray[np.bool_]:
+    def is_driven(self, metres: FitSamples) -> Mask:
         """Return where motors, not the slope, drive the robot, shape (M,)."""
         always = _always(self.terms)
         return np.asarray(_build_design_matrix(metres, self.terms)[:, ~always] @ self.value[~always] > 0.0)
@@ -178,7 +178,7 @@ def _is_significant(found: Physics, term: str, metres: FitSamples) -> bool:
     return bool(value > 2.0 * std and (bend or term != "drivetrain"))
 
 
-def _always(terms: Sequence[tuple[str, str]]) -> NDArray[np.bool_]:
+def _always(terms: Sequence[tuple[str, str]]) -> Mask:
     return np.array([term in _ALWAYS for term, _ in terms])
 
 
@@ -264,7 +264,7 @@ def _fit_non_negative(made: Floats, target: Floats) -> Floats:
 
 
 def _estimate_covariance(
-    made: Floats, off: Floats, weight: Floats, scale: float, *, free: NDArray[np.bool_], prior: Floats | None
+    made: Floats, off: Floats, weight: Floats, scale: float, *, free: Mask, prior: Floats | None
 ) -> Floats:
     """Return the covariance of coefficients and k, shape (J + 1, J + 1), by what blocks of consecutive rows leave over."""
     rows = made[:, free] / scale

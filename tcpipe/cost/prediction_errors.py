@@ -34,11 +34,11 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression, nnls
 from scipy.special import ndtr, ndtri, stdtrit
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 
 Classes = NDArray[np.integer]
 Stated = Floats | float | None
-Near = NDArray[np.bool_] | None
+Near = Mask | None
 Residuals = Mapping[str, NDArray[np.generic]]
 
 COVERAGE = 0.9

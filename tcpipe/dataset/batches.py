@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats32, Ints
+from tcpipe.arrays import Floats32, Ints, Mask
 from tcpipe.dataset.tensor import TensorLayout
 from tcpipe.formats.dataset_files import PatchFiles
 
@@ -223,8 +223,6 @@ class Batches:
         return batch if self.weights is None else (*batch, self.weights[samples])
 
 
-def _compute_features(
-    named: Sequence[tuple[str, NDArray[np.generic]]], samples: Ints, mirrored: NDArray[np.bool_]
-) -> NDArray[np.float32]:
+def _compute_features(named: Sequence[tuple[str, NDArray[np.generic]]], samples: Ints, mirrored: Mask) -> Floats32:
     columns = [np.where(mirrored & (name in _FLIPPED), -1.0, 1.0) * column[samples] for name, column in named]
     return np.column_stack(columns).astype(np.float32)

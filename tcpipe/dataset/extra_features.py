@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Floats32, Ints, Mask
 
 if TYPE_CHECKING:
     from tcpipe.dataset.split import Split
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class ExtraFeatures:
     """Extra features of N segments, shape (N,) each."""
 
-    class_id: NDArray[np.int64]
+    class_id: Ints
     """Terrain class under the chord; 0 if unknown."""
     slope_rad: Floats
     """Along travel, uphill positive."""
@@ -28,7 +28,7 @@ class ExtraFeatures:
     command_mps: Floats
     """Commanded speed; NaN if unknown."""
 
-    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> ExtraFeatures:
+    def take(self, rows: Ints | Mask | slice) -> ExtraFeatures:
         """Return some of them."""
         return ExtraFeatures(*(getattr(self, entry.name)[rows] for entry in fields(self)))
 
@@ -98,7 +98,7 @@ def _form_values(columns: Iterable[Floats]) -> tuple[Floats, Floats]:
     return rate * duration / arc, command
 
 
-def append_planes(patches: NDArray[np.float32], numbers: Floats) -> NDArray[np.float32]:
+def append_planes(patches: Floats32, numbers: Floats) -> Floats32:
     """Return patches, shape (N, px, px, depth), with a channel of one value for each of N rows of numbers."""
     if not numbers.shape[1]:
         return patches
@@ -106,9 +106,7 @@ def append_planes(patches: NDArray[np.float32], numbers: Floats) -> NDArray[np.f
     return np.concatenate([patches, planes], axis=3)
 
 
-def append_column_planes(
-    inputs: Sequence[ExtraFeature], patches: NDArray[np.float32], columns: NDArray[np.floating]
-) -> NDArray[np.float32]:
+def append_column_planes(inputs: Sequence[ExtraFeature], patches: Floats32, columns: NDArray[np.floating]) -> Floats32:
     """Return patches of a batch with a plane for each extra feature, from `COLUMNS` of the batch, shape (N, 4)."""
     turn, command = _form_values(columns.T.astype(np.float64))
     features = replace(empty_extra_features(len(columns)), turn_radpm=turn, command_mps=command)

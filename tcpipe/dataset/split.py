@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import ArrayLike, NDArray
 
-from tcpipe.arrays import Floats32, Ints
+from tcpipe.arrays import Floats, Floats32, Ints
 from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
 from tcpipe.dataset.energies import ENERGIES, Energy, find_energy, name_common_std
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
@@ -165,13 +165,13 @@ class Split:
         """Return a column of samples.parquet, shape (N,)."""
         return self._columns[name][self.view.at]
 
-    def own_std(self, name: str) -> NDArray[np.float64]:
+    def own_std(self, name: str) -> Floats:
         """Return the standard deviation ``name`` of each label without the part that all labels of a run share, shape (N,)."""
         total = self.column(name).astype(np.float64)
         shared = np.nan_to_num(self.column(name_common_std(name)).astype(np.float64))
         return np.sqrt(np.maximum(total**2 - shared**2, 0.0))
 
-    def layers(self, indices: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+    def layers(self, indices: Ints) -> dict[str, NDArray[Any]]:
         """Return the stored layers of samples, each of shape (B, px, px): as ``dataset.json`` says of each."""
         return self.view.stored.gather(self.view.at[indices], self.view.form.layers)
 
@@ -315,13 +315,13 @@ class Split:
         return self.view.form.form(self.layers(indices), np.arange(len(indices)))
 
 
-def _compute_inverse_variance_weights(std: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_inverse_variance_weights(std: Floats) -> Floats:
     """Return weights with a mean of 1 from standard deviations, shape (N,); 0 where one is not finite."""
     known = np.isfinite(std)
     if not known.any():
         return np.zeros(std.shape)
     least = max(_MIN_STD * float(np.median(std[known])), float(np.finfo(np.float32).tiny))
-    weights: NDArray[np.float64] = np.where(known, np.maximum(np.where(known, std, 1.0), least) ** -2, 0.0)
+    weights: Floats = np.where(known, np.maximum(np.where(known, std, 1.0), least) ** -2, 0.0)
     return np.asarray(weights / weights.mean())
 
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats32, Ints, Mask
+from tcpipe.arrays import Bytes, Floats32, Ints, Mask
 from tcpipe.compiled import compile_kernel
 from tcpipe.errors import DatasetError
 from tcpipe.terrain.layers import Layer, sort_layers
@@ -17,7 +17,7 @@ from tcpipe.terrain.layers import Layer, sort_layers
 
 @compile_kernel
 def form_bytes(  # noqa: PLR0917
-    layer: NDArray[np.uint8], rows: Ints, mirrored: Mask, value: Floats32, channel: int, out: Floats32
+    layer: Bytes, rows: Ints, mirrored: Mask, value: Floats32, channel: int, out: Floats32
 ) -> None:
     """Write ``value`` of each byte of ``rows`` to one channel of ``out``, (B, px, px, C)."""
     px = out.shape[1]
@@ -104,7 +104,7 @@ class TensorLayout:
         layer = self.known[self._name_layer(channel)]
         return 1 if layer.name == channel else round(layer.high)
 
-    def form(self, pixels: Pixels, rows: NDArray[np.int64], mirrored: NDArray[np.bool_] | None = None) -> Floats32:
+    def form(self, pixels: Pixels, rows: Ints, mirrored: Mask | None = None) -> Floats32:
         """Return the tensor of ``rows``, shape (B,), of stored layers: float32, shape (B, px, px, depth).
 
         ``mirrored`` marks those that are mirrored across their direction of travel, shape (B,).

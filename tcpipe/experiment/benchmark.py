@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from tcpipe import __version__
+from tcpipe.arrays import Floats
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import UsageError, clean_lines
 from tcpipe.formats.atomic import write_text
@@ -195,7 +196,7 @@ def _summarize(  # noqa: PLR0917
                 )  # fmt: skip
 
 
-def estimate_rmse(off: NDArray[np.float64], runs: NDArray[np.str_]) -> Ratio:
+def estimate_rmse(off: Floats, runs: NDArray[np.str_]) -> Ratio:
     """Return the root mean square of errors, shape (trainings, N), with its 95 % interval.
 
     The variance of the mean square is that between runs, whose samples err alike, and that between trainings over their number.

@@ -12,9 +12,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Floats32, Ints
 from tcpipe.cost.prediction_errors import make_residuals
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.formats.json_files import read_as, write_json
@@ -27,7 +26,7 @@ from tcpipe.learning.training import make_training_samples
 
 logger = logging.getLogger("tcpipe")
 
-Batch = tuple[NDArray[np.float32], NDArray[np.float32]]
+Batch = tuple[Floats32, Floats32]
 
 ALL_LAYERS, HEIGHTS, GRASS = "a net per class, all layers", "Wei & Isler, a net per class", "Wei & Isler, grass only"
 
@@ -133,9 +132,7 @@ def _predict_by_class(networks: Networks, part: Measured, *, chord_m: float, of_
     return Predicted({"E": energy}, {})
 
 
-def _predict_energy(
-    samples: Samples, fitted: Fitted, split: Split, class_id: NDArray[np.int64], chord_m: float
-) -> Floats:
+def _predict_energy(samples: Samples, fitted: Fitted, split: Split, class_id: Ints, chord_m: float) -> Floats:
     """Return centred energies [J]; of a network of energy alone as of a power at 1 m/s."""
     there = replace(samples, split=split.with_channels(*samples.inputs.channels))
     is_held, alone = find_held_out(fitted.held_out), len(samples.inputs.outputs) == 1

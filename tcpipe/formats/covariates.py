@@ -7,11 +7,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import polars as pl
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints, Mask
 from tcpipe.errors import DatasetError
 from tcpipe.formats.integrity import Checksum, compute_checksum
 from tcpipe.formats.logs.table_stamps import read_clock
@@ -44,7 +43,7 @@ class CovariateTable:
         """First and last stamp, ISO 8601."""
         return _format_utc(self.rows[_STAMP][0]), _format_utc(self.rows[_STAMP][-1])
 
-    def join(self, stamp_ns: NDArray[np.int64], *, max_age_s: float) -> tuple[pa.Table, NDArray[np.bool_]]:
+    def join(self, stamp_ns: Ints, *, max_age_s: float) -> tuple[pa.Table, Mask]:
         """Return the last row at or before each stamp that is not older than the limit; and which stamps a row reaches.
 
         ``stamp_ns`` (UTC, shape (N,)) may be in any order; columns are called as the file, without its ending, and the column. They are

@@ -24,6 +24,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import verify_document
@@ -96,10 +97,10 @@ class Pixels:
 
     layers: Mapping[str, Layer]
     patch_px: int
-    slots: NDArray[np.int64]
-    read: Callable[[str, NDArray[np.int64]], LayerPixels]
+    slots: Ints
+    read: Callable[[str, Ints], LayerPixels]
 
-    def of(self, rows: slice | NDArray[np.int64]) -> Pixels:
+    def of(self, rows: slice | Ints) -> Pixels:
         """Return the patches of some rows."""
         return replace(self, slots=self.slots[rows])
 
@@ -128,8 +129,8 @@ class ParquetShardWriter:
 
     out: Place
     pixels: Pixels
-    samples: Callable[[NDArray[np.int64]], pa.Table]
-    rows: NDArray[np.int64]
+    samples: Callable[[Ints], pa.Table]
+    rows: Ints
     shard: Shard
 
     def write(self) -> None:
@@ -215,7 +216,7 @@ def _open_layer_array(
 
 
 def make_parquet_writers(
-    out: Place, pixels: Pixels, samples: Callable[[NDArray[np.int64]], pa.Table], split: NDArray[np.str_]
+    out: Place, pixels: Pixels, samples: Callable[[Ints], pa.Table], split: NDArray[np.str_]
 ) -> list[Drawer]:
     """Return ``data/<split>-*.parquet``, to be written to ``out``: the columns of the samples and each layer as a plain fixed-size list.
 
@@ -329,7 +330,7 @@ class PatchFiles:
     directory: Path
     layers: Mapping[str, Layer]
     patch_px: int
-    starts: NDArray[np.int64]
+    starts: Ints
     arrays: Mapping[str, ShardedArray] = field(default_factory=dict)
     """Zarr: the array of each layer; a piece is a chunk."""
     groups: tuple[tuple[str, int], ...] = ()
@@ -436,7 +437,7 @@ def _open_sharded_patches(directory: Path, layers: Mapping[str, Layer], px: int,
     return PatchFiles(directory, layers, px, starts, groups=tuple((path, group) for path, group, _ in groups))
 
 
-def find_places_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> NDArray[np.int64]:
+def find_places_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> Ints:
     """Return the row of each sample in the order of the files, (N,); ``splits`` is the samples' column, (N,)."""
     places = np.arange(len(splits))
     if card.format == "parquet":  # one split after the other

@@ -15,6 +15,7 @@ from shapely import GeometryType
 from shapely.geometry.base import BaseGeometry
 from shapely.validation import explain_validity
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import PathError, RegionError
 from tcpipe.formats.json_files import Json
 from tcpipe.splits.regions import Regions
@@ -272,7 +273,7 @@ class LineFeature(Generic[P]):
     type: Literal["Feature"] = "Feature"
 
 
-def read_line(path: Path) -> NDArray[np.float64]:
+def read_line(path: Path) -> Floats:
     """Read the path of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2; `PathError` without one, or with several lines."""
     try:
         features = list(_iterate_features(path))
@@ -288,20 +289,20 @@ def read_line(path: Path) -> NDArray[np.float64]:
     if more or line.geom_type != "LineString":
         name = "several lines or other parts" if more else repr(line.geom_type)
         raise PathError(f"{where}: geometry is {name}, expected one LineString")
-    lonlat: NDArray[np.float64] = shapely.get_coordinates(line)
+    lonlat: Floats = shapely.get_coordinates(line)
     if (lonlat == lonlat[0]).all():
         raise PathError(f"{where}: its line is one point; expected a path from one point to another")
     check_lonlat(where, lonlat)
     return lonlat
 
 
-def check_lonlat(where: str, lonlat_deg: NDArray[np.float64]) -> None:
+def check_lonlat(where: str, lonlat_deg: Floats) -> None:
     """Raise `PathError` for positions, shape (P, 2), that are no longitude and latitude."""
     if problem := _find_lonlat_problem(lonlat_deg):
         raise PathError(f"{where}: {problem}")
 
 
-def _find_lonlat_problem(lonlat_deg: NDArray[np.float64]) -> str | None:
+def _find_lonlat_problem(lonlat_deg: Floats) -> str | None:
     lon, lat = lonlat_deg[np.argmax(np.abs(lonlat_deg).max(axis=1))]
     if 90.0 < abs(lat) <= 180.0 and abs(lon) <= 90.0:
         return f"coordinates ({lon:g}, {lat:g}) are no lon/lat: the axes look swapped; longitude comes first"
@@ -312,7 +313,7 @@ def _find_lonlat_problem(lonlat_deg: NDArray[np.float64]) -> str | None:
     return None
 
 
-def make_line_feature(lonlat_deg: NDArray[np.float64], properties: P) -> LineFeature[P]:
+def make_line_feature(lonlat_deg: Floats, properties: P) -> LineFeature[P]:
     """Return a line through points, shape (P, 2), as a feature of GeoJSON."""
     points = np.round(lonlat_deg, _DECIMALS).tolist()
     return LineFeature(properties, LineString(tuple((lon, lat) for lon, lat in points)))

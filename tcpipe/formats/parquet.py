@@ -21,6 +21,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import DTypeLike, NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import to_json_line
@@ -275,7 +276,7 @@ def add_segments_metadata(table: pa.Table, datum: Datum | None) -> pa.Table:
 
 
 def add_geo_metadata(
-    table: pa.Table, kind: Literal["LineString", "Point"], points_deg: NDArray[np.float64], *, crs: str = _WGS84
+    table: pa.Table, kind: Literal["LineString", "Point"], points_deg: Floats, *, crs: str = _WGS84
 ) -> pa.Table:
     """Return a table whose metadata says what its column ``geometry`` holds.
 
@@ -306,7 +307,7 @@ def map_table(path: Path) -> pa.Table:
         return pa.ipc.open_file(source).read_all()
 
 
-def take_rows(table: pa.Table, rows: NDArray[np.int64]) -> pa.Table:
+def take_rows(table: pa.Table, rows: Ints) -> pa.Table:
     """Return rows of a table: `pa.Table.take` would copy all of each column that has several chunks."""
     order = np.argsort(rows, kind="stable")
     ascending, first, taken = rows[order], 0, []
@@ -337,7 +338,7 @@ def move_to_file(array: NDArray[N], directory: Path) -> NDArray[N]:
     return mapped
 
 
-def move_rows_to_file(array: NDArray[N], rows: NDArray[np.int64], directory: Path) -> NDArray[N]:
+def move_rows_to_file(array: NDArray[N], rows: Ints, directory: Path) -> NDArray[N]:
     """Return rows of an array as `make_mapped_array` gives them."""
     mapped = make_mapped_array(directory, (len(rows), *array.shape[1:]), array.dtype)
     if mapped.size:

@@ -10,7 +10,9 @@ latitude by Bowring's iteration (B. R. Bowring, Survey Review 23 (181), 1976), r
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from tcpipe.arrays import Floats
 
 SEMI_MAJOR_AXIS_M = 6378137.0
 FLATTENING = 1 / 298.257223563
@@ -19,7 +21,7 @@ _E2 = FLATTENING * (2 - FLATTENING)
 _E2_PRIME = _E2 / (1 - _E2)
 
 
-def ecef_from_geodetic(lon_deg: ArrayLike, lat_deg: ArrayLike, alt_m: ArrayLike) -> NDArray[np.float64]:
+def ecef_from_geodetic(lon_deg: ArrayLike, lat_deg: ArrayLike, alt_m: ArrayLike) -> Floats:
     """Return earth-centred, earth-fixed coordinates.
 
     Parameters
@@ -39,7 +41,7 @@ def ecef_from_geodetic(lon_deg: ArrayLike, lat_deg: ArrayLike, alt_m: ArrayLike)
     )
 
 
-def geodetic_from_ecef(ecef_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def geodetic_from_ecef(ecef_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """Return longitude [deg] in [-180, 180], latitude [deg] and height above the ellipsoid [m], each of shape (...).
 
     Parameters
@@ -60,7 +62,7 @@ def geodetic_from_ecef(ecef_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[
     return np.degrees(np.arctan2(y, x)), np.degrees(lat), alt
 
 
-def ecef_from_enu_rotation(lon_deg: float, lat_deg: float) -> NDArray[np.float64]:
+def ecef_from_enu_rotation(lon_deg: float, lat_deg: float) -> Floats:
     """Return the rotation (3, 3) whose columns are east, north and up at a place, in earth-centred axes."""
     sl, cl = np.sin(np.radians(lon_deg)), np.cos(np.radians(lon_deg))
     sp, cp = np.sin(np.radians(lat_deg)), np.cos(np.radians(lat_deg))
@@ -69,7 +71,7 @@ def ecef_from_enu_rotation(lon_deg: float, lat_deg: float) -> NDArray[np.float64
 
 def enu_from_geodetic(
     lon_deg: ArrayLike, lat_deg: ArrayLike, alt_m: ArrayLike, *, datum_deg_m: tuple[float, float, float]
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return coordinates in the east-north-up frame of a datum.
 
     Parameters
@@ -85,9 +87,7 @@ def enu_from_geodetic(
     return offset @ ecef_from_enu_rotation(datum_deg_m[0], datum_deg_m[1])
 
 
-def geodetic_from_enu(
-    enu_m: ArrayLike, *, datum_deg_m: tuple[float, float, float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def geodetic_from_enu(enu_m: ArrayLike, *, datum_deg_m: tuple[float, float, float]) -> tuple[Floats, Floats, Floats]:
     """Return longitude [deg], latitude [deg] and height above the ellipsoid [m] of points (..., 3) in a datum's frame [m]."""
     rotation = ecef_from_enu_rotation(datum_deg_m[0], datum_deg_m[1])
     return geodetic_from_ecef(np.asarray(enu_m, np.float64) @ rotation.T + ecef_from_geodetic(*datum_deg_m))

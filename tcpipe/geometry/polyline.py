@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.compiled import compile_kernel
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -21,7 +22,7 @@ _PARTS = 8
 """An interval is looked at in so many parts: 6 ms at 20 Hz."""
 
 
-def find_row_before(stamp_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+def find_row_before(stamp_ns: Ints, at_ns: Ints) -> NDArray[np.intp]:
     """Return for each time the row that begins its interval: the last row at or before it, at most the last but one.
 
     Parameters
@@ -44,27 +45,27 @@ class Polyline:
     length_m : [m], shape (N,): horizontal length of the Hermite path from the first sample.
     """
 
-    stamp_ns: NDArray[np.int64]
-    position_m: NDArray[np.float64]
-    velocity_mps: NDArray[np.float64]
-    length_m: NDArray[np.float64]
+    stamp_ns: Ints
+    position_m: Floats
+    velocity_mps: Floats
+    length_m: Floats
 
-    def position_at(self, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def position_at(self, at_ns: Ints) -> Floats:
         """Return positions at times inside the span: [m], shape (M, 3); at a sample's own stamp its position, exactly."""
         row, u, step_s = _locate(self.stamp_ns, at_ns)
         v0, v1 = self.velocity_mps[row] * step_s, self.velocity_mps[row + 1] * step_s
         blend = u * u * (3.0 - 2.0 * u)
         swing = u * (1.0 - u) * ((1.0 - u) * v0 - u * v1)
-        between: NDArray[np.float64] = self.position_m[row] * (1.0 - blend) + self.position_m[row + 1] * blend + swing
+        between: Floats = self.position_m[row] * (1.0 - blend) + self.position_m[row + 1] * blend + swing
         return between
 
-    def length_at(self, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def length_at(self, at_ns: Ints) -> Floats:
         """Return the horizontal length from the first sample to each time: [m], shape (M,).
 
         Differences telescope, so the pieces of a path add up to the whole.
         """
         row, u, step_s = _locate(self.stamp_ns, at_ns)
-        between: NDArray[np.float64] = self.length_m[row] + _compute_partial_length_m(
+        between: Floats = self.length_m[row] + _compute_partial_length_m(
             self.position_m[:, :2], self.velocity_mps[:, :2], row, u, step_s
         )
         return between
@@ -83,9 +84,7 @@ class Polyline:
         return None if found < 0 else found
 
 
-def fit_polyline(
-    stamp_ns: NDArray[np.int64], position_m: NDArray[np.float64], velocity_mps: NDArray[np.float64]
-) -> Polyline:
+def fit_polyline(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats) -> Polyline:
     """Return the path through samples: cubic Hermite between them, its length by 8-node Gauss-Legendre quadrature of its speed.
 
     Parameters
@@ -100,9 +99,7 @@ def fit_polyline(
     return Polyline(stamp_ns, position_m, velocity_mps, np.concatenate(([0.0], np.cumsum(steps))))
 
 
-def _locate(
-    stamp_ns: NDArray[np.int64], at_ns: NDArray[np.int64]
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+def _locate(stamp_ns: Ints, at_ns: Ints) -> tuple[NDArray[np.intp], Floats, Floats]:
     """Return each time's interval, its share of it (0 to 1) and the interval's length [s]; the latter two of shape (M, 1)."""
     row = find_row_before(stamp_ns, at_ns)
     step_s = (stamp_ns[row + 1] - stamp_ns[row])[:, None].astype(np.float64) * _NS
@@ -110,18 +107,18 @@ def _locate(
 
 
 def _compute_partial_length_m(
-    xy_m: NDArray[np.float64],
-    velocity_mps: NDArray[np.float64],
+    xy_m: Floats,
+    velocity_mps: Floats,
     row: NDArray[np.intp],
-    until: NDArray[np.float64],
-    step_s: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    until: Floats,
+    step_s: Floats,
+) -> Floats:
     """Return the length from each row's sample to the share ``until`` (M, 1) of its interval."""
     u = (until * (0.5 * (_GAUSS_NODES + 1.0)))[:, :, None]
     step_m = (xy_m[row + 1] - xy_m[row])[:, None, :]
     v0, v1 = (velocity_mps[row] * step_s)[:, None, :], (velocity_mps[row + 1] * step_s)[:, None, :]
     tangent = 6.0 * u * (1.0 - u) * step_m + (1.0 - u) * (1.0 - 3.0 * u) * v0 + u * (3.0 * u - 2.0) * v1
-    length: NDArray[np.float64] = until[:, 0] * (np.hypot(tangent[..., 0], tangent[..., 1]) @ (0.5 * _GAUSS_WEIGHTS))
+    length: Floats = until[:, 0] * (np.hypot(tangent[..., 0], tangent[..., 1]) @ (0.5 * _GAUSS_WEIGHTS))
     return length
 
 

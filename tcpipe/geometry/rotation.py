@@ -10,10 +10,12 @@ of a matrix follows S. W. Shepperd, "Quaternion from rotation matrix", J. Guidan
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from tcpipe.arrays import Floats
 
 
-def wrap_to_pi(angle_rad: ArrayLike) -> NDArray[np.float64]:
+def wrap_to_pi(angle_rad: ArrayLike) -> Floats:
     """Return the same directions in [-pi, pi).
 
     Parameters
@@ -30,7 +32,7 @@ def wrap_to_pi(angle_rad: ArrayLike) -> NDArray[np.float64]:
     return np.maximum(np.where(wrapped >= np.pi, -np.pi, wrapped), -np.pi)
 
 
-def normalize(quat_xyzw: ArrayLike) -> NDArray[np.float64]:
+def normalize(quat_xyzw: ArrayLike) -> Floats:
     """Return quaternions of unit length with w >= 0; NaN where the length is zero or not finite. Shape (..., 4)."""
     quat = np.asarray(quat_xyzw, np.float64)
     length = np.linalg.norm(quat, axis=-1, keepdims=True)
@@ -39,7 +41,7 @@ def normalize(quat_xyzw: ArrayLike) -> NDArray[np.float64]:
     return np.where(unit[..., 3:] < 0, -unit, unit)
 
 
-def matrix_from_quat(quat_xyzw: ArrayLike) -> NDArray[np.float64]:
+def matrix_from_quat(quat_xyzw: ArrayLike) -> Floats:
     """Return the rotation matrix (..., 3, 3) of unit quaternions (..., 4). Solà eq. 115."""
     x, y, z, w = np.moveaxis(np.asarray(quat_xyzw, np.float64), -1, 0)
     rows = (
@@ -50,7 +52,7 @@ def matrix_from_quat(quat_xyzw: ArrayLike) -> NDArray[np.float64]:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
-def quat_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
+def quat_from_matrix(rotation: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3); the largest component is the divisor."""
     R = np.asarray(rotation, np.float64)
     trace = np.trace(R, axis1=-2, axis2=-1)
@@ -65,7 +67,7 @@ def quat_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
     return normalize(np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :])
 
 
-def quat_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) -> NDArray[np.float64]:
+def quat_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4) of fixed-axis roll, pitch, yaw [rad]."""
     r, p, y = np.broadcast_arrays(*(np.asarray(a, np.float64) / 2 for a in (roll_rad, pitch_rad, yaw_rad)))
     sr, cr, sp, cp, sy, cy = np.sin(r), np.cos(r), np.sin(p), np.cos(p), np.sin(y), np.cos(y)
@@ -82,7 +84,7 @@ def quat_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike)
     )
 
 
-def rpy_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
+def rpy_from_matrix(rotation: ArrayLike) -> Floats:
     """Return roll, pitch, yaw [rad] (..., 3), each in [-pi, pi), pitch in [-pi/2, pi/2], of rotation matrices (..., 3, 3)."""
     R = np.asarray(rotation, np.float64)
     pitch = np.arcsin(np.clip(-R[..., 2, 0], -1.0, 1.0))
@@ -90,12 +92,12 @@ def rpy_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
     return np.where(rpy >= np.pi, -np.pi, rpy)
 
 
-def rpy_from_quat(quat_xyzw: ArrayLike) -> NDArray[np.float64]:
+def rpy_from_quat(quat_xyzw: ArrayLike) -> Floats:
     """Return roll, pitch, yaw [rad] (..., 3) of unit quaternions (..., 4)."""
     return rpy_from_matrix(matrix_from_quat(quat_xyzw))
 
 
-def multiply(a_from_b_xyzw: ArrayLike, b_from_c_xyzw: ArrayLike) -> NDArray[np.float64]:
+def multiply(a_from_b_xyzw: ArrayLike, b_from_c_xyzw: ArrayLike) -> Floats:
     """Return a_from_c (..., 4), w >= 0: the quaternion product. Solà eq. 12."""
     x1, y1, z1, w1 = np.moveaxis(np.asarray(a_from_b_xyzw, np.float64), -1, 0)
     x2, y2, z2, w2 = np.moveaxis(np.asarray(b_from_c_xyzw, np.float64), -1, 0)
@@ -112,19 +114,19 @@ def multiply(a_from_b_xyzw: ArrayLike, b_from_c_xyzw: ArrayLike) -> NDArray[np.f
     )
 
 
-def invert(a_from_b_xyzw: ArrayLike) -> NDArray[np.float64]:
+def invert(a_from_b_xyzw: ArrayLike) -> Floats:
     """Return b_from_a (..., 4) of unit quaternions: the conjugate."""
-    conjugate: NDArray[np.float64] = np.asarray(a_from_b_xyzw, np.float64) * np.array([-1.0, -1.0, -1.0, 1.0])
+    conjugate: Floats = np.asarray(a_from_b_xyzw, np.float64) * np.array([-1.0, -1.0, -1.0, 1.0])
     return conjugate
 
 
-def rotate(a_from_b_xyzw: ArrayLike, vector: ArrayLike) -> NDArray[np.float64]:
+def rotate(a_from_b_xyzw: ArrayLike, vector: ArrayLike) -> Floats:
     """Return vectors (..., 3) given in b as coordinates in a."""
-    turned: NDArray[np.float64] = np.einsum("...ij,...j->...i", matrix_from_quat(a_from_b_xyzw), np.asarray(vector))
+    turned: Floats = np.einsum("...ij,...j->...i", matrix_from_quat(a_from_b_xyzw), np.asarray(vector))
     return turned
 
 
-def quat_from_rotation_vector(rotation_vector_rad: ArrayLike) -> NDArray[np.float64]:
+def quat_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Floats:
     """Return the exponential: unit quaternions (..., 4) of rotation vectors [rad] (..., 3). Solà eq. 101."""
     vector = np.asarray(rotation_vector_rad, np.float64)
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
@@ -132,7 +134,7 @@ def quat_from_rotation_vector(rotation_vector_rad: ArrayLike) -> NDArray[np.floa
     return normalize(np.concatenate((half_sinc * vector, np.cos(angle / 2)), -1))
 
 
-def rotation_vector_from_quat(quat_xyzw: ArrayLike) -> NDArray[np.float64]:
+def rotation_vector_from_quat(quat_xyzw: ArrayLike) -> Floats:
     """Return the logarithm: rotation vectors [rad] (..., 3), length in [0, pi], of quaternions (..., 4). Solà eq. 105."""
     quat = normalize(quat_xyzw)
     sine = np.linalg.norm(quat[..., :3], axis=-1, keepdims=True)

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.coverage import Coverage
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.learning.baselines import SPLITS
@@ -321,7 +321,7 @@ def draw_predictions(table: pa.Table, audit: str) -> PageSection:
     return PageSection("Measured against predicted", f"{text}\n{audit}", plots=plots)
 
 
-def _read_slope_deg(table: pa.Table) -> NDArray[np.float64]:
+def _read_slope_deg(table: pa.Table) -> Floats:
     return np.degrees(to_floats(table, "slope_rad"))
 
 

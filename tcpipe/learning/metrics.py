@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.tables.facts import ABSENT
 
 QUANTITIES = ("w", "v", "T", "E")
@@ -64,7 +64,7 @@ class Spread:
     low: Floats
     high: Floats
 
-    def take(self, rows: NDArray[np.bool_]) -> Spread:
+    def take(self, rows: Mask) -> Spread:
         """Return some of them."""
         return Spread(self.std[rows], self.low[rows], self.high[rows])
 
@@ -115,7 +115,7 @@ def mean_known(values: Iterable[float | None]) -> float | None:
 def compute_errors_by_class(
     predicted: Costs,
     measured: Costs,
-    class_ids: NDArray[np.int64],
+    class_ids: Ints,
     names: Mapping[int, str],
     spreads: Mapping[str, Spread] | None = None,
 ) -> dict[str, dict[str, Errors]]:
@@ -129,7 +129,7 @@ def compute_errors_by_class(
     spreads : what is stated of the predictions' errors, by quantity.
     """
 
-    def compute_rows(quantity: str, rows: NDArray[np.bool_]) -> Errors:
+    def compute_rows(quantity: str, rows: Mask) -> Errors:
         spread = (spreads or {}).get(quantity)
         said, true = predicted[quantity][rows], measured[quantity][rows]
         return compute_errors(said, true, LEAST[quantity], spread and spread.take(rows))
@@ -137,23 +137,21 @@ def compute_errors_by_class(
     return {quantity: _group_by_class(partial(compute_rows, quantity), class_ids, names) for quantity in predicted}
 
 
-def _group_by_class(
-    compute: Callable[[NDArray[np.bool_]], Errors], class_ids: NDArray[np.int64], names: Mapping[int, str]
-) -> dict[str, Errors]:
+def _group_by_class(compute: Callable[[Mask], Errors], class_ids: Ints, names: Mapping[int, str]) -> dict[str, Errors]:
     """Return what is computed of rows, by the name of each class that occurs, and of `ALL`."""
     rows = {name: class_ids == class_id for class_id, name in names.items()} | {ALL: np.ones(len(class_ids), np.bool_)}
     return {name: compute(here) for name, here in rows.items() if here.any() or name == ALL}
 
 
 def compute_label_floor(
-    deviations: Costs, measured: Costs, class_ids: NDArray[np.int64], names: Mapping[int, str]
+    deviations: Costs, measured: Costs, class_ids: Ints, names: Mapping[int, str]
 ) -> dict[str, dict[str, Errors]]:
     """Return the errors that a perfect prediction would have for the labels' own deviations, shape (N,) each.
 
     The labels' errors are taken as Gaussian: a mean absolute error of sqrt(2 / pi) deviations.
     """
 
-    def compute_rows(quantity: str, rows: NDArray[np.bool_]) -> Errors:
+    def compute_rows(quantity: str, rows: Mask) -> Errors:
         label, std = measured[quantity][rows], deviations[quantity][rows]
         large = label >= LEAST[quantity]
         mape = 100.0 * np.sqrt(2.0 / np.pi) * float(np.mean(std[large] / label[large])) if large.any() else None

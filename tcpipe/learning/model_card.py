@@ -8,8 +8,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
 from tcpipe.formats.integrity import Checksum
@@ -36,13 +36,13 @@ class LayerRange:
     """Largest distance from the mean of all training samples and bands, in standard deviations."""
 
     @classmethod
-    def estimate(cls, values: NDArray[np.float64]) -> LayerRange:
+    def estimate(cls, values: Floats) -> LayerRange:
         """Return the range of patches, shape (N, bands)."""
         mean, std = values.mean(axis=0), values.std(axis=0)
         plain = cls(tuple(mean.tolist()), tuple(np.maximum(std, _LEAST_SHARE * np.abs(mean) + 1e-9).tolist()), 0.0)
         return replace(plain, largest=float(plain.compute_distance(values).max()))
 
-    def compute_distance(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def compute_distance(self, values: Floats) -> Floats:
         """Return how far the farthest band of each patch is from the mean, in standard deviations, shape (N,)."""
         return np.asarray((np.abs(values - np.array(self.mean)) / np.array(self.std)).max(axis=1))
 

@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats32
+from tcpipe.arrays import Floats, Floats32, Mask
 from tcpipe.cost.prediction_errors import QuantityErrors, estimate_correlation, fit_errors
 from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
 from tcpipe.errors import ModelError, StoreError, UsageError
@@ -69,7 +69,7 @@ class Model:
     """Columns of the held-out samples: run_id, start_ns, terrain_class, labels, predictions."""
     own: OwnKind | None = None
     """The user's code."""
-    ground_deg: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
+    ground_deg: Floats = field(default_factory=lambda: np.empty((0, 2)))
     """Longitude and latitude of the training samples, shape (N, 2)."""
 
     @cached_property
@@ -95,7 +95,7 @@ class Model:
         """Return the errors on held-out samples; None if they are too few."""
         return fit_errors(self.residuals)
 
-    def find_near(self, lonlat_deg: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def find_near(self, lonlat_deg: Floats) -> Mask:
         """Return which points, shape (N, 2), are near ground of training samples."""
         return are_near(lonlat_deg, self.ground_deg, within_m=CLOSE * self.card.chord_m, in_degrees=True)
 

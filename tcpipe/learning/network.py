@@ -97,7 +97,7 @@ class ResNet18(nn.Module):
                 out[part] = self(move_to_device(patches[part])).numpy(force=True)
         return out
 
-    def arrays(self) -> dict[str, NDArray[np.float32]]:
+    def arrays(self) -> dict[str, Floats32]:
         """Return a copy of every weight by torch's name."""
         return {name: value.numpy(force=True).copy(order="C") for name, value in self._list_weights().items()}
 

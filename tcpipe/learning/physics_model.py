@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.cost.physics import ALL, FEWEST, FitSamples, Physics, fit_physics
 from tcpipe.dataset import Split
 from tcpipe.dataset.energies import ENERGIES
@@ -152,11 +152,11 @@ class Curves:
     """Slopes where the curves bend; none: a mean of each class."""
     pooled: Floats
     """Coefficients of all ground, and of unknown classes, shape (J, outputs)."""
-    class_id: NDArray[np.int64]
+    class_id: Ints
     own: Floats
     """Coefficients of each of these classes, shape (classes, J, outputs)."""
 
-    def predict(self, slope_rad: Floats, class_id: NDArray[np.int64]) -> Floats:
+    def predict(self, slope_rad: Floats, class_id: Ints) -> Floats:
         """Return outputs, shape (N, outputs), of metres of ground."""
         made = _evaluate_functions(self.knots_rad, slope_rad)
         out = made @ self.pooled
@@ -234,9 +234,7 @@ class MeanModel(CurveModel):
     quantiles: ClassVar[tuple[float, ...]] = ()
 
 
-def fit_curves(
-    slope_rad: Floats, class_id: NDArray[np.int64], labels: Floats, *, quantiles: Sequence[float] = _KNOTS
-) -> Curves:
+def fit_curves(slope_rad: Floats, class_id: Ints, labels: Floats, *, quantiles: Sequence[float] = _KNOTS) -> Curves:
     """Fit a curve of every class.
 
     Parameters
@@ -257,9 +255,7 @@ def fit_curves(
     return Curves(knots, pooled, classes, own)
 
 
-def cross_fit_curves(
-    slope_rad: Floats, class_id: NDArray[np.int64], labels: Floats, folds: NDArray[np.generic]
-) -> Floats:
+def cross_fit_curves(slope_rad: Floats, class_id: Ints, labels: Floats, folds: NDArray[np.generic]) -> Floats:
     """Return the predictions of linear curves of the other folds, shape (N, outputs)."""
     out = np.empty_like(labels)
     for fold in np.unique(folds):

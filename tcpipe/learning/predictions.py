@@ -8,9 +8,8 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.cost.prediction_errors import COVERAGE, Residuals, fit_bias_correction, propagate_stated
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import read_extra_features
@@ -39,7 +38,7 @@ class Measured:
     deviations: Mapping[str, Floats]
     own_deviations: Mapping[str, Floats]
     """Standard deviations without the error that all labels of a run share, which a model learns."""
-    class_ids: NDArray[np.int64]
+    class_ids: Ints
     names: Mapping[int, str]
     """Names of the classes that occur, by id."""
 
@@ -77,7 +76,7 @@ class Predicted:
     """Standard deviations by the predictor; 0 where it states none."""
 
     @classmethod
-    def centre(cls, residuals: Residuals, said: Prediction, class_ids: NDArray[np.int64], chord_m: float) -> Predicted:
+    def centre(cls, residuals: Residuals, said: Prediction, class_ids: Ints, chord_m: float) -> Predicted:
         """Return costs of predictions of power and velocity, by the predictor's own held-out samples."""
         is_time = "velocity_mps" in residuals and "power_watt" not in residuals
         names = ("v", "T") if is_time else QUANTITIES
@@ -226,7 +225,7 @@ def compute_cost_errors(table: pa.Table, quantity: str) -> Floats:
     return to_floats(table, make_column_name(quantity, "predicted")) - to_floats(table, make_column_name(quantity))
 
 
-def find_worst_rows(table: pa.Table, count: int) -> NDArray[np.int64]:
+def find_worst_rows(table: pa.Table, count: int) -> Ints:
     """Return the rows of the ``count`` samples of each split with the largest errors of the main cost, largest first, split by split."""
     off, split = np.abs(compute_cost_errors(table, find_main_cost(table))), to_texts(table.column("split"))
     found = [np.empty(0, np.int64)]

@@ -30,13 +30,13 @@ from typing import Any, ClassVar, Protocol, TypeAlias, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Floats32, Ints, Mask
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeature, ExtraFeatures, read_extra_features
 from tcpipe.errors import ModelError
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes, compute_loss_factors, mean_loss
 
-Patches: TypeAlias = NDArray[np.float32]
+Patches: TypeAlias = Floats32
 Labels: TypeAlias = NDArray[np.floating]
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
@@ -96,7 +96,7 @@ class Prediction:
         mean[:, 1], covariance[:, 1, 1] = self.mean[:, 0], self.covariance[:, 0, 0]
         return Prediction(mean, covariance)
 
-    def take(self, rows: NDArray[np.bool_]) -> Prediction:
+    def take(self, rows: Mask) -> Prediction:
         """Return some of them."""
         return Prediction(self.mean[rows], self.covariance[rows])
 
@@ -116,7 +116,7 @@ class Samples:
         """Return the number of samples."""
         return len(self.split)
 
-    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Samples:
+    def take(self, rows: Ints | Mask) -> Samples:
         """Return some of them."""
         return replace(self, split=self.split.take(rows))
 
@@ -295,7 +295,7 @@ def ask_predictor(
     return Prediction(mean, covariance)
 
 
-def find_held_out(held_out: Prediction) -> NDArray[np.bool_]:
+def find_held_out(held_out: Prediction) -> Mask:
     """Return which samples have a held-out prediction, shape (N,)."""
     return np.asarray(np.isfinite(held_out.mean).all(axis=1))
 

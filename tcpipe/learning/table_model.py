@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Floats32, Ints
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeatures, standardize_features
 from tcpipe.errors import ModelError
@@ -68,9 +68,7 @@ def compute_patch_features(patches: Patches, *, channels: Sequence[str], class_c
     return np.column_stack(parts).astype(np.float64)
 
 
-def find_slope_and_class(
-    features: Floats, channels: Sequence[str], class_count: int
-) -> tuple[Floats, NDArray[np.int64]]:
+def find_slope_and_class(features: Floats, channels: Sequence[str], class_count: int) -> tuple[Floats, Ints]:
     """Return slope [rad] and most frequent class of patches by their features, shape (N,) each; 0 without heights, or classes."""
     slope, class_id = np.zeros(len(features)), np.zeros(len(features), np.int64)
     for channel, at in _locate_features(channels, class_count):
@@ -100,7 +98,7 @@ def _locate_features(channels: Sequence[str], class_count: int) -> Iterator[tupl
         at += _OF_BAND if _is_band(channel) else known.get(channel, _OF_OTHERS)
 
 
-def _compute_ground_features(height_m: Patches, patch_m: float) -> NDArray[np.float32]:
+def _compute_ground_features(height_m: Patches, patch_m: float) -> Floats32:
     px = height_m.shape[1]
     along = np.tile((np.arange(px) + 0.5) / px * patch_m - patch_m / 2.0, (px, 1))
     across = along.T

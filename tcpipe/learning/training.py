@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.cost.prediction_errors import FEWEST, NEAR, make_residuals
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import name_common_std
@@ -127,7 +126,7 @@ def _compute_losses(samples: Samples, predicted: Floats) -> Floats:
     return np.asarray(np.sum(losses, axis=0))
 
 
-def is_within_error(difference: Floats, clusters: NDArray[np.int64]) -> bool:
+def is_within_error(difference: Floats, clusters: Ints) -> bool:
     """Return whether the mean of differences is no more than its standard error, whose clusters err alike."""
     sums = np.bincount(clusters, difference - difference.mean())
     count = int(np.unique(clusters).size)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.logs import roles
 from tcpipe.logs.expressions import (
     FORM,
@@ -285,7 +285,7 @@ def find_topic(name: str, role: str, columns: Collection[str], power_type: str |
     return f"/{name}" if find_quantity(name) == alone else f"/{name}/{alone}", FLOAT_TYPES[1]
 
 
-def parse_stamps_ns(values: Array, unit: str) -> NDArray[np.int64] | str:
+def parse_stamps_ns(values: Array, unit: str) -> Ints | str:
     """Return finite numbers, shape (N,), as [ns], or why they are no stamps.
 
     ``unit`` is s, ms, us or ns; auto infers it from their size, since 1979.
@@ -300,15 +300,15 @@ def parse_stamps_ns(values: Array, unit: str) -> NDArray[np.int64] | str:
     if np.issubdtype(values.dtype, np.integer):
         return np.asarray(values, np.int64) * factor
     whole: Floats = np.floor(values)
-    found: NDArray[np.int64] = whole.astype(np.int64) * factor + np.round((values - whole) * factor).astype(np.int64)
+    found: Ints = whole.astype(np.int64) * factor + np.round((values - whole) * factor).astype(np.int64)
     return found
 
 
-def utc_from_gps_ns(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def utc_from_gps_ns(stamp_ns: Ints) -> Ints:
     """Return GPS time written as a date [ns since 1970] as UTC [ns]; from July 2012 on."""
     since = np.array([(start + leap) * 1_000_000_000 for start, leap in _LEAPS])
     leap_s = np.array([leap for _, leap in _LEAPS], np.int64)[np.searchsorted(since, stamp_ns, side="right") - 1]
-    found: NDArray[np.int64] = stamp_ns - leap_s * 1_000_000_000
+    found: Ints = stamp_ns - leap_s * 1_000_000_000
     return found
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.logs.expressions import simplify_name
 
 Array = NDArray[Any]
@@ -91,7 +91,7 @@ def classify_fixes(values: Array, codes: str) -> Floats:
     return found
 
 
-def classify_status(status: NDArray[np.int64], codes: str) -> Floats:
+def classify_status(status: Ints, codes: str) -> Floats:
     """Return the quality of each fix by the status of its message; one that is always 0 says nothing, as many drivers set no other."""
     return classify_fixes(status, codes) if np.any(status > 0) else np.full(len(status), _UNKNOWN)
 

@@ -14,9 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 
 NS_PER_DAY = 86_400_000_000_000
 
@@ -38,7 +37,7 @@ class Gga:
     """
 
     row: Ints
-    broken: NDArray[np.bool_]
+    broken: Mask
     time_of_day_ns: Ints
     lat_deg: Floats
     lon_deg: Floats
@@ -57,7 +56,7 @@ class OverGround:
     """
 
     row: Ints
-    broken: NDArray[np.bool_]
+    broken: Mask
     time_of_day_ns: Ints
     speed_mps: Floats
     course_rad: Floats
@@ -80,7 +79,7 @@ def read_over_ground(sentences: Sequence[str]) -> OverGround:
 
 def _read(
     sentences: Sequence[str], kind: str, parse: Callable[[list[str]], tuple[float, ...]], width: int
-) -> tuple[Ints, NDArray[np.bool_], Floats]:
+) -> tuple[Ints, Mask, Floats]:
     """Return where sentences of a kind stand, which are broken, and what ``parse`` makes of their fields, shape (width, N)."""
     found = [(row, match) for row, text in enumerate(sentences) if (match := _SENTENCES[kind].search(text)) is not None]
     values = np.full((len(found), width), np.nan)
@@ -163,7 +162,7 @@ def _parse_time_of_day_ns(text: str) -> int:
     return ((hours * 60 + minutes) * 60 + seconds) * 1_000_000_000 + nanoseconds
 
 
-def add_date(time_of_day_ns: NDArray[np.int64], log_time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def add_date(time_of_day_ns: Ints, log_time_ns: Ints) -> Ints:
     """Return UTC stamps [ns], shape (N,): on the day that keeps the time nearest to the log's clock; 0 where it is negative (unknown).
 
     A constant offset between both clocks, even one near half a day, keeps one sign throughout: the first row decides, and later rows stay
@@ -179,6 +178,6 @@ def add_date(time_of_day_ns: NDArray[np.int64], log_time_ns: NDArray[np.int64]) 
     return stamps
 
 
-def _wrap_to_zero(offset_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    wrapped: NDArray[np.int64] = (offset_ns + NS_PER_DAY // 2) % NS_PER_DAY - NS_PER_DAY // 2
+def _wrap_to_zero(offset_ns: Ints) -> Ints:
+    wrapped: Ints = (offset_ns + NS_PER_DAY // 2) % NS_PER_DAY - NS_PER_DAY // 2
     return wrapped

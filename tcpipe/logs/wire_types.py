@@ -16,7 +16,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import Bytes, Ints, Mask
 from tcpipe.logs.topics import normalize_type_name
 
 MAX_COLUMNS = 20_000
@@ -260,7 +260,7 @@ class Grid:
     shape: tuple[int, ...]
     strides: tuple[int, ...]
 
-    def view(self, data: NDArray[np.uint8], dtype: np.dtype[np.generic], count: int = 1) -> NDArray[np.generic]:
+    def view(self, data: Bytes, dtype: np.dtype[np.generic], count: int = 1) -> NDArray[np.generic]:
         """Return a copy of the values there, ``count`` of them side by side at each place, in the order of `list_offsets`."""
         together = dtype if count == 1 else np.dtype(f"V{count * dtype.itemsize}")  # many at once are copied faster
         if not count:
@@ -321,10 +321,10 @@ class WalkResult:
     """Values of the messages that fit their definition; ``fits``, (N,), marks these messages."""
 
     root: Fields | None
-    fits: NDArray[np.bool_]
+    fits: Mask
 
 
-def walk(message: Record, data: NDArray[np.uint8], starts: Ints, ends: Ints, dialect: Dialect) -> WalkResult:
+def walk(message: Record, data: Bytes, starts: Ints, ends: Ints, dialect: Dialect) -> WalkResult:
     """Find every field of every message; `RaggedError` where they are so unlike that they are cheaper to read one by one.
 
     Each begins and ends in ``data`` at ``starts`` and ``ends``, shape (N,), rising.
@@ -358,7 +358,7 @@ class _Cursors:
     While ``_bases`` is a grid, messages have one size, ``_at`` is the position in all of them, and one that does not fit is an error.
     """
 
-    def __init__(self, data: NDArray[np.uint8], bases: Places, sizes: Ints, dialect: Dialect) -> None:
+    def __init__(self, data: Bytes, bases: Places, sizes: Ints, dialect: Dialect) -> None:
         self._data, self._bases, self._sizes, self._dialect = data, bases, sizes, dialect
         self._at, self._steps = 0, 0
         self._positions, self._good = np.zeros(len(sizes), np.int64), sizes >= 0
@@ -366,10 +366,10 @@ class _Cursors:
             (max(len(data) - 3, 0),), "V4", data if len(data) > 3 else b"", 0, (1,)
         )
 
-    def find_finished(self) -> NDArray[np.bool_]:
+    def find_finished(self) -> Mask:
         """Return which messages fit, and have no more bytes left than may follow the last field."""
         left = self._sizes - (self._at if isinstance(self._bases, Grid) else self._positions)
-        finished: NDArray[np.bool_] = self._good & (left >= 0) & (left <= self._dialect.padding)
+        finished: Mask = self._good & (left >= 0) & (left <= self._dialect.padding)
         return finished
 
     def values(self, wire_type: WireType, rows: Ints) -> Values:

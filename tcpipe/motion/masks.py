@@ -7,9 +7,8 @@ shape (N,). A slowdown that the terrain causes is the signal: where commands are
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Mask
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.motion.row_sections import (
     MotionRows,
     compute_window_mean,
@@ -109,7 +108,7 @@ def find_command_changes(rows: MotionRows, *, step_mps: float, window_s: float, 
     return make_mask(np.array(spans, dtype=np.int64).reshape(-1, 2), len(command))
 
 
-def _estimate_jitter(command: Floats, part: NDArray[np.int64], window: int) -> Floats:
+def _estimate_jitter(command: Floats, part: Ints, window: int) -> Floats:
     """Return what row-to-row scatter leaves in the difference of the means after and before each row, [m/s], shape (N,)."""
     square = np.concatenate((np.zeros(min(len(command), 1)), 0.5 * np.diff(command) ** 2))
     scatter = np.fmax(
@@ -157,7 +156,7 @@ def find_top_command(
     return top, float(np.mean(settled[moving] >= share_of_top * top))
 
 
-def _select_known_command(rows: MotionRows) -> tuple[NDArray[np.int64], Floats]:
+def _select_known_command(rows: MotionRows) -> tuple[Ints, Floats]:
     """Return pieces that end also where the command becomes known or unknown, and the command with 0 for unknown."""
     known = np.isfinite(rows.commanded_mps)
     broken = (np.diff(rows.piece) != 0) | (np.diff(known.astype(np.int8)) != 0)

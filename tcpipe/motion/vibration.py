@@ -13,9 +13,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 
 LOW_HZ, HIGH_HZ = 3.0, 20.0
 LEAST_RATE_HZ = 2.5 * HIGH_HZ
@@ -91,12 +90,12 @@ def _filter_band(values: Floats, period_s: float) -> Floats:
     return passed
 
 
-def _is_without_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_s: float) -> NDArray[np.bool_]:
+def _is_without_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_s: float) -> Mask:
     """Return which spans have no gap in them or near them."""
     gaps = np.concatenate(([0], np.cumsum(np.diff(stamp_ns) * _NS > longest_s)))
     last, near_ns = len(stamp_ns) - 1, round(_RINGS_S / _NS)
     before = np.searchsorted(stamp_ns, start_ns - near_ns, side="right") - 1
     after = np.searchsorted(stamp_ns, end_ns + near_ns, side="left")
     inside = (start_ns >= stamp_ns[0]) & (end_ns <= stamp_ns[-1])
-    known: NDArray[np.bool_] = inside & (gaps[np.minimum(after, last)] == gaps[np.maximum(before, 0)])
+    known: Mask = inside & (gaps[np.minimum(after, last)] == gaps[np.maximum(before, 0)])
     return known

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.errors import clean_lines
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, RecordChange, compare_records, format_value
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches, read_card, read_samples, sample_columns
@@ -130,8 +130,8 @@ def _compute_shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:
     }
 
 
-def _read_values(table: pa.Table, name: str) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = table.column(name).to_numpy().astype(np.float64)
+def _read_values(table: pa.Table, name: str) -> Floats:
+    values: Floats = table.column(name).to_numpy().astype(np.float64)
     return values
 
 
@@ -201,7 +201,7 @@ def _find_differing_patches(
     return differs
 
 
-def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> NDArray[np.int64]:
+def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> Ints:
     """Return a hash of every patch, in the order of the samples: equal pixels, equal hashes."""
     files = open_patches(directory, card)
     found = np.empty(table.num_rows, np.int64)
@@ -212,7 +212,7 @@ def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> NDArra
         found[files.starts[piece] : files.starts[piece + 1]] = [
             hash(b"".join(part.tobytes() for part in parts)) for parts in zip(*flat, strict=True)
         ]
-    places: NDArray[np.int64] = found[find_places_in_files(card, table.column("split").to_numpy())]
+    places: Ints = found[find_places_in_files(card, table.column("split").to_numpy())]
     return places
 
 

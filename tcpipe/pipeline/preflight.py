@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.errors import TcpipeError, clean_lines
 from tcpipe.formats.finding_lines import describe_power, format_findings, format_loss, list_verdict
 from tcpipe.formats.logs.log_joining import open_single_log
@@ -218,7 +218,7 @@ def _estimate_yield(labelled: LabelledSegments) -> ExpectedYield:
     )
 
 
-def _compute_hourly_std(start_ns: NDArray[np.int64], span_s: float) -> float | None:
+def _compute_hourly_std(start_ns: Ints, span_s: float) -> float | None:
     windows = int(span_s // _WINDOW_S)
     if windows < _FEWEST_WINDOWS:
         return None

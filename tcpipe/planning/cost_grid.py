@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats32, Mask
+from tcpipe.arrays import Bytes, Floats, Floats32, Ints, Mask
 from tcpipe.errors import MapError
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_model import BATCH, NO_COST, Bits, Reason, SegmentPredictions, iterate_predictions
@@ -29,7 +29,7 @@ _FIRST_QUARTER = ((1, 0), (2, 1), (1, 1), (1, 2))
 """East and north in cells."""
 
 
-def _list_moves() -> NDArray[np.int64]:
+def _list_moves() -> Ints:
     moves = np.array(_FIRST_QUARTER)
     quarters = [moves]
     for _ in range(3):
@@ -77,8 +77,8 @@ def find_crossed_cells(course: int) -> tuple[CrossedCell, ...]:
     return CrossedCell(0, 0, 0.25), middle, CrossedCell(side_e, side_n, 0.25), CrossedCell(east, north, 0.25)
 
 
-Classes = NDArray[np.uint8]
-Cells = NDArray[np.int64]
+Classes = Bytes
+Cells = Ints
 
 CELLS_OF_BLOCK = BATCH // COURSES
 
@@ -127,7 +127,7 @@ class CostGrid:
         slowness = 1.0 / self.velocity_mps
         return np.asarray(self.power_watt * slowness if objective == "energy" else slowness)
 
-    def open_courses(self, *, allow_extrapolation: bool) -> NDArray[np.bool_]:
+    def open_courses(self, *, allow_extrapolation: bool) -> Mask:
         """Return the courses that may be driven, shape (16, rows, cols): without obstacle, and inside the training range."""
         forbidden = np.uint16(BARRED) if allow_extrapolation else np.uint16(0xFFFF)
         return np.asarray(self.reasons & forbidden == 0)
@@ -166,9 +166,7 @@ def make_empty_grid(grid: MapGrid) -> CostGrid:
     )
 
 
-def iterate_blocks(
-    source: MapReader, model: Model, grid: MapGrid, wanted: NDArray[np.bool_] | None = None
-) -> Iterator[Cells]:
+def iterate_blocks(source: MapReader, model: Model, grid: MapGrid, wanted: Mask | None = None) -> Iterator[Cells]:
     """Yield flat indices of cells, at most `CELLS_OF_BLOCK` together, by tile of the map, so that each tile is decoded once.
 
     A map wider than 29 tiles is cut into strips; the tiles at their borders are decoded twice.
@@ -213,7 +211,7 @@ class CellFrames:
         along = np.tile(DIRECTIONS / self.metres(cells)[:, None], (cells.size, 1))
         return PatchFrames(np.repeat(centre, COURSES, axis=0), along, np.stack([-along[:, 1], along[:, 0]], axis=1))
 
-    def metres(self, cells: Cells) -> NDArray[np.float64]:
+    def metres(self, cells: Cells) -> Floats:
         """Return ground metres a map metre along each course at the cells, shape (16,), linear between the grid's corners."""
         down, right = np.divmod(cells, self._grid.cols)
         v, u = down.mean() / max(self._grid.rows - 1, 1), right.mean() / max(self._grid.cols - 1, 1)

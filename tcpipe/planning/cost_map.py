@@ -26,7 +26,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats32
+from tcpipe.arrays import Bytes, Floats, Floats32
 from tcpipe.cost.prediction_errors import QuantityErrors
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, lock_directory, make_scratch_directory, write_text
@@ -320,7 +320,7 @@ class _Strips:
 
     costs: CostGrid
     errors: Mapping[str, QuantityErrors] | None
-    class_id: NDArray[np.uint8]
+    class_id: Bytes
 
     def compute(self, name: str, first: int, last: int) -> Floats32:
         """Return a quantity of rows, and its minimum, mean, best course and standard deviation, shape (20, rows, cols).
@@ -342,7 +342,7 @@ class _Strips:
         return np.concatenate([values, np.stack(more)]).astype(np.float32)
 
 
-def _mean(values: NDArray[np.floating]) -> NDArray[np.float64]:
+def _mean(values: NDArray[np.floating]) -> Floats:
     """Return the mean over the courses that have a value; NaN where none has."""
     known = ~np.isnan(values)
     count = known.sum(axis=0)
@@ -355,15 +355,13 @@ def _read_reasons(costs: CostGrid, first: int, last: int) -> NDArray[np.uint16]:
     return np.concatenate([bits, np.bitwise_and.reduce(bits, axis=0)[None]])
 
 
-def _compute_mean(strips: _Strips, name: str) -> NDArray[np.float64]:
+def _compute_mean(strips: _Strips, name: str) -> Floats:
     """Return the mean of a quantity over the trusted courses, shape (rows, cols); NaN without any."""
     rows = iterate_row_strips(strips.costs.grid)
     return np.concatenate([strips.compute(name, first, last)[_MEAN_BAND - 1] for first, last in rows])
 
 
-def _resample(
-    values: NDArray[np.uint8], outside: int, grid: MapGrid, frame: Frame
-) -> tuple[NDArray[np.uint8], MapGrid]:
+def _resample(values: Bytes, outside: int, grid: MapGrid, frame: Frame) -> tuple[Bytes, MapGrid]:
     """Return the values of cells on a grid of the frame, and the grid."""
     own = frame.cover(grid)
     cells, is_on = frame.find_cells(grid, own)

@@ -15,7 +15,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Bytes, Floats, Mask
 from tcpipe.cost.prediction_errors import fit_bias_correction, propagate_stated
 from tcpipe.dataset.extra_features import ExtraFeatures
 from tcpipe.errors import ModelError
@@ -116,7 +116,7 @@ def count_reasons(bits: Bits) -> dict[str, int]:
     return {name: count for name, count in counts.items() if count}
 
 
-def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: Model, source: MapReader) -> Bits:
+def find_reasons(patches: Patches, on_map: Mask, model: Model, source: MapReader) -> Bits:
     """Return the reasons of each patch of a map, shape (N,); ``on_map`` says whether it lies wholly on it, shape (N,)."""
     bits = np.zeros(on_map.size, np.uint16)
     bits[patches.valid_fraction < 1.0] |= np.uint16(Reason.NODATA)
@@ -138,7 +138,7 @@ def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: Model, sour
     return bits
 
 
-def _find_class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: Model, source: MapReader) -> Bits:
+def _find_class_reasons(patches: Patches, terrain: Bytes, model: Model, source: MapReader) -> Bits:
     """Return the reasons by class: not traversable, or not in training; a model of another class table has no terrain input."""
     traversable = source.classes.traversable()
     bits = np.zeros(len(terrain), np.uint16)
@@ -179,7 +179,7 @@ class SegmentPredictions:
     velocity_mps: Floats
     duration_std_s: Floats
     energy_std_joule: Floats
-    terrain_class: NDArray[np.uint8]
+    terrain_class: Bytes
     slope_rad: Floats
     cross_slope_rad: Floats
     height_m: Floats
@@ -203,12 +203,12 @@ def iterate_predictions(
     )
     correction, tiles = fit_bias_correction(model.residuals), TilePool(choose_level(source, side / px))
 
-    def sample(frames: PatchFrames) -> tuple[Patches, NDArray[np.bool_]]:
+    def sample(frames: PatchFrames) -> tuple[Patches, Mask]:
         chord_m = np.full(len(frames.centre_xy_m), model.card.chord_m)
         on_map = count_corners_on(source.grid, compute_footprints(frames, side)) == 4
         return sample_patches(source, frames, chord_m, patch_m=side, patch_px=px, pool=tiles), on_map
 
-    def judge(patches: Patches, on_map: NDArray[np.bool_], first: int) -> SegmentPredictions:
+    def judge(patches: Patches, on_map: Mask, first: int) -> SegmentPredictions:
         bits = find_reasons(patches, on_map, model, source)
         asked = bits & NO_COST == 0
         turns = np.full(on_map.size, np.nan) if turn_radpm is None else turn_radpm[first : first + on_map.size]
@@ -241,7 +241,7 @@ def iterate_predictions(
             first += on_map.size
 
 
-def predict_patches(model: Model, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats) -> Prediction:
+def predict_patches(model: Model, patches: Patches, asked: Mask, turn_radpm: Floats) -> Prediction:
     """Return power [W] and velocity [m/s] of N patches; NaN where the model is not asked, or predicts no motion.
 
     ``asked`` and ``turn_radpm``, how far a metre of each turns (NaN: as usual), have shape (N,). The speed that is commanded is the

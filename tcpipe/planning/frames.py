@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.errors import UsageError
 from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
 from tcpipe.terrain.projection import Projection
@@ -85,7 +84,7 @@ class Frame:
         rows, cols = (max(int(np.ceil(side / size - _SLIVER)), 1) for side in (top - bottom, right - left))
         return MapGrid("ENU", left, top, size, rows, cols)
 
-    def find_cells(self, grid: MapGrid, own: MapGrid) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def find_cells(self, grid: MapGrid, own: MapGrid) -> tuple[Ints, Mask]:
         """Return the flat cell of ``grid`` under the middle of each cell of the frame's ``own`` grid, and which lie on it."""
         row, col = np.mgrid[: own.rows, : own.cols]
         middle = own.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(np.float64))

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.adaptation import MeasuredRun
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.errors import MapError, ModelError, StoreError, UsageError, clean_lines
@@ -165,7 +165,7 @@ class PlanResult(PlanTotals):
     """Goal of Nav2's FollowGPSWaypoints."""
 
     @property
-    def lonlat_deg(self) -> NDArray[np.float64]:
+    def lonlat_deg(self) -> Floats:
         """Read the points of the path from its file: longitude and latitude [deg], WGS 84, shape (P, 2)."""
         return np.array(read_as(self.out, PlanFile).features[0].geometry.coordinates)
 

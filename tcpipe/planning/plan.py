@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Mask
+from tcpipe.arrays import Bytes, Floats, Ints, Mask
 from tcpipe.cost.prediction_errors import QuantityErrors
 from tcpipe.errors import ModelError, PathError
 from tcpipe.formats.json_files import convert_record
@@ -42,7 +41,7 @@ from tcpipe.terrain.sampling import find_classes_at
 
 logger = logging.getLogger("tcpipe")
 
-Classes = NDArray[np.uint8]
+Classes = Bytes
 Objective = Literal["energy", "time", "distance"]
 
 OBJECTIVES: tuple[Objective, ...] = ("energy", "time", "distance")
@@ -179,7 +178,7 @@ class _Search:
     step: Callable[[int, int], None]
 
     @property
-    def _cells(self) -> NDArray[np.int64]:
+    def _cells(self) -> Ints:
         """Flat indices of the cells of start and goal."""
         grid = self.survey.costs.grid
         col, row = np.floor(grid.px_from_xy(self.ends_xy_m) + 0.5).astype(np.int64).T

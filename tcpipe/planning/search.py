@@ -26,14 +26,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Bytes, Floats, Floats32, Ints, Mask
 from tcpipe.compiled import compile_kernel
 from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.planning.cost_grid import ANGLES_DEG, COURSES, MOVES, CostGrid, find_crossed_cells
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.layers import ClassTable
 
-Classes = NDArray[np.uint8]
+Classes = Bytes
 
 _LEAST = 1e-9
 """Least cost of a step, so that no two states precede each other."""
@@ -58,7 +58,7 @@ class GridSteps(NamedTuple):
     shares : of the step in each of them, shape (16, 4).
     """
 
-    per_metre: NDArray[np.float32]
+    per_metre: Floats32
     height_m: Floats
     length_m: Floats
     crossed: Ints
@@ -82,7 +82,7 @@ class LeastCostPath:
     """Steps that gain more energy than their height explains; they cost nothing."""
 
 
-def make_steps(costs: CostGrid, per_metre: NDArray[np.float32], open_: NDArray[np.bool_], metres: Floats) -> GridSteps:
+def make_steps(costs: CostGrid, per_metre: Floats32, open_: Mask, metres: Floats) -> GridSteps:
     """Return every step along every course.
 
     Parameters
@@ -205,9 +205,7 @@ class Turning:
     joule_per_rad: Floats
     usual_radpm: float
 
-    def energy_joule(
-        self, turn_rad: Floats, length_m: Floats, class_id: NDArray[np.uint8], *, is_driven: bool = False
-    ) -> Floats:
+    def energy_joule(self, turn_rad: Floats, length_m: Floats, class_id: Bytes, *, is_driven: bool = False) -> Floats:
         """Return the cost of turns beyond the usual [J], shape (N,), of N path segments of these lengths on these classes.
 
         A driven segment may turn less than usual and cost less; a drawn one counts as usual, since no robot drives as straight as a line.
@@ -348,7 +346,7 @@ def find_best_lines(  # noqa: PLR0917
 
 @compile_kernel
 def _compute_line_cost(  # noqa: PLR0917
-    per_metre: NDArray[np.float32],
+    per_metre: Floats32,
     angles: Floats,
     metres: Floats,
     begin: Floats,
@@ -412,7 +410,7 @@ def straighten_path(steps: GridSteps, points_px: Floats) -> Floats:
     return points
 
 
-def _choose_window(points: NDArray[np.float64]) -> int:
+def _choose_window(points: Floats) -> int:
     """Return how many points earlier a line may begin, which bounds the work."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     each = max(float(steps.mean()), 1.0) * SAMPLES_A_CELL / 2.0

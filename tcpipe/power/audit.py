@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.power.rails import Rail, interpolate_rail
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
@@ -199,7 +199,7 @@ def _estimate_ohm(by_volt: Floats, by_amp: Floats) -> float | None:
     return ohm if ohm > _CLEAR * std_ohm else None
 
 
-def find_lost_signs(sag: Sag | None, start_ns: Ints, end_ns: Ints, rise: Floats) -> NDArray[np.bool_]:
+def find_lost_signs(sag: Sag | None, start_ns: Ints, end_ns: Ints, rise: Floats) -> Mask:
     """Return the segments whose current flows back, but has no sign, shape (M,); none unless several downhill ones surely show it.
 
     There voltage and current rise together: the likelihoods of both signs are compared. ``rise`` is the tangent of the slope along travel.
@@ -222,6 +222,6 @@ def find_lost_signs(sag: Sag | None, start_ns: Ints, end_ns: Ints, rise: Floats)
     order = np.argsort(rise)
     steep = order[: int(np.argmax(np.cumsum(gain[order]))) + 1]  # few of which are clear by themselves
     # Segments as steep as most of these may flow back for a part of their time.
-    lost: NDArray[np.bool_] = ~driven & ((gain > 0.0) | (rise <= np.quantile(rise[clear & ~driven], 0.8)))
+    lost: Mask = ~driven & ((gain > 0.0) | (rise <= np.quantile(rise[clear & ~driven], 0.8)))
     lost[steep] |= ~driven[steep]
     return lost

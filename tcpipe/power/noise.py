@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.power.rails import Rail, SampledSignal, interpolate_rail, sum_power
@@ -123,7 +122,7 @@ def _estimate_integral_variance(
     return scale * between, error + _estimate_rounding(signal, start_ns, end_ns)
 
 
-def _find_cells(at_s: Floats, edge_s: Floats) -> tuple[NDArray[np.int64], Floats]:
+def _find_cells(at_s: Floats, edge_s: Floats) -> tuple[Ints, Floats]:
     """Return the cell between edges, (N + 1,), in which each time lies, and the share of the cell before the time, shape (M,)."""
     place = np.interp(at_s, edge_s, np.arange(len(edge_s)))
     cell = np.minimum(place.astype(np.int64), len(edge_s) - 2)

@@ -20,9 +20,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.geometry.piecewise_linear import integrate_held_to, integrate_product_to, interpolate
 
 _PERIODS = 3
@@ -141,7 +140,7 @@ def compute_power_at(rails: list[Rail], at_ns: Ints, *, max_gap_ns: int) -> tupl
     return volt, amp, watt
 
 
-def _is_near_samples(stamp_ns: Ints, at_ns: Ints, max_gap_ns: int) -> NDArray[np.bool_]:
+def _is_near_samples(stamp_ns: Ints, at_ns: Ints, max_gap_ns: int) -> Mask:
     """Return whether each time, shape (M,), is that of a sample, or between two that are near each other."""
     if stamp_ns.size == 0:
         return np.zeros(at_ns.size, np.bool_)
@@ -224,9 +223,7 @@ class IdlePower:
     highest_watt: float = np.nan
 
 
-def estimate_idle_power(
-    power_watt: Floats, halt: NDArray[np.int64], *, window_rows: int, step_watt: float
-) -> IdlePower:
+def estimate_idle_power(power_watt: Floats, halt: Ints, *, window_rows: int, step_watt: float) -> IdlePower:
     """Return the idle power. A second is about as long as a segment takes, and its mean is finer than the record's step.
 
     Parameters

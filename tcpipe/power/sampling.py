@@ -18,9 +18,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.power.rails import Rail, Rule, SampledSignal, integrate_energy
 from tcpipe.tables.facts import Smoothing
 from tcpipe.tables.findings import read_threshold
@@ -39,7 +38,7 @@ _JUMPING_SHARE = 0.1
 """Smallest share of changes by more than one level."""
 
 
-def find_readings(stamp_ns: Ints, values: Floats) -> NDArray[np.int64] | None:
+def find_readings(stamp_ns: Ints, values: Floats) -> Ints | None:
     """Return the rows on which new readings arrived, shape (R,); None where messages do not surely repeat readings.
 
     A reading that equals the one before it shows no change: its row is the one at which it is expected. ``stamp_ns`` [ns], shape (N,), does
@@ -80,9 +79,7 @@ def _find_reading_period(interval: Floats) -> float | None:
     return period if is_repeated else None
 
 
-def _find_arrivals(
-    at_ns: Floats, changed: NDArray[np.int64], *, period_ns: float, message_ns: float
-) -> NDArray[np.int64]:
+def _find_arrivals(at_ns: Floats, changed: Ints, *, period_ns: float, message_ns: float) -> Ints:
     """Return the rows that change, and those at which equal readings are expected: evenly between changes, and beyond the outer ones.
 
     Where messages are missing for a reading's period, the age of the first message after them is not known: it is no arrival.
@@ -263,7 +260,7 @@ def find_smoothing(fit: PowerFit, *, corrected_s: float = 0.0) -> Smoothing | No
     return tried[int(np.argmin(unexplained))] if min(unexplained) <= limit else None
 
 
-def estimate_smoothing_variance(power: SampledSignal, steady: NDArray[np.bool_], smoothing: Smoothing) -> float:
+def estimate_smoothing_variance(power: SampledSignal, steady: Mask, smoothing: Smoothing) -> float:
     """Return the variance of power [W²] that smoothing hides, by how smoothed power [W] changes while ``steady``, shape (N,)."""
     at_s = (power.stamp_ns - power.stamp_ns[0]) / 1e9
     earlier_s = at_s - smoothing.width_s

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.power.plausibility import REJECTED
 from tcpipe.power.rails import UNIT_VOLT, is_power_only
 from tcpipe.robots import FieldPath, PowerSource, parse_fields
@@ -56,10 +56,10 @@ def select_joints(columns: Columns, source: PowerSource) -> JointMotion:
     return JointMotion(tuple(joints), source.torque_scale * values[0], source.speed_scale * values[1])
 
 
-def _find_layouts(names: NDArray[np.str_]) -> dict[tuple[str, ...], NDArray[np.int64]]:
+def _find_layouts(names: NDArray[np.str_]) -> dict[tuple[str, ...], Ints]:
     """Return the rows of at least one message, shape (N, k), by their lists of names."""
     first = np.flatnonzero(np.concatenate(([True], (names[1:] != names[:-1]).any(axis=1))))
-    found: dict[tuple[str, ...], list[NDArray[np.int64]]] = {}
+    found: dict[tuple[str, ...], list[Ints]] = {}
     for rows in np.split(np.arange(len(names)), first[1:]):
         found.setdefault(tuple(names[rows[0]].tolist()), []).append(rows)
     return {layout: np.concatenate(parts) for layout, parts in found.items()}
@@ -313,7 +313,7 @@ _BESIDE, _CROWDED = 20, 10.0
 """Levels next to the end of a range, and how many times as many values as on one of them are at the end of a clipped current."""
 
 
-def find_unmeasured(parts: Floats, stamp_ns: Ints, *, wraps_amp: float | None = None) -> NDArray[np.bool_]:
+def find_unmeasured(parts: Floats, stamp_ns: Ints, *, wraps_amp: float | None = None) -> Mask:
     """Return the rows in which one of several currents, shape (N, K), is clipped, or repeats a value while another changes, shape (N,)."""
     found = np.zeros(len(parts), np.bool_)
     parts = np.where(np.abs(parts) <= _IMPOSSIBLE, parts, np.nan)
@@ -324,7 +324,7 @@ def find_unmeasured(parts: Floats, stamp_ns: Ints, *, wraps_amp: float | None = 
     return found
 
 
-def _is_clipped(values: Floats) -> NDArray[np.bool_]:
+def _is_clipped(values: Floats) -> Mask:
     """Return where a current is at the end of its sensor's range: values crowd there, and stay."""
     levels, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     at_end = np.zeros(len(values), np.bool_)
@@ -338,7 +338,7 @@ def _is_clipped(values: Floats) -> NDArray[np.bool_]:
     return at_end if 2 * stays.sum() >= at_end.sum() else np.zeros_like(at_end)
 
 
-def _is_frozen(values: Floats, others: Floats, stamp_ns: Ints) -> NDArray[np.bool_]:
+def _is_frozen(values: Floats, others: Floats, stamp_ns: Ints) -> Mask:
     """Return where a current repeats one value for seconds while one of the others, shape (N, K), changes as in driving."""
     frozen = np.zeros(len(values), np.bool_)
     first = np.flatnonzero(np.concatenate(([True], values[1:] != values[:-1])))
@@ -382,7 +382,7 @@ def unwrap_currents(current_amp: Floats, wraps_amp: float) -> Floats:
     return np.where(current_amp > wraps_amp / 2, current_amp - wraps_amp, current_amp)
 
 
-def _choose_stamps(columns: Columns) -> NDArray[np.int64]:
+def _choose_stamps(columns: Columns) -> Ints:
     """Return the header's stamps where all are set, else the log's times [ns]: messages are written down in bursts."""
     if "header.stamp.sec" in columns:
         stamps = np.asarray(columns["header.stamp.sec"], np.int64) * 1_000_000_000
@@ -485,7 +485,7 @@ class Counter:
     """A counter row by row: energy since the first row [J], shape (N,), NaN where a row has none, and how often it was reset before."""
 
     energy_joule: Floats
-    resets: NDArray[np.int64]
+    resets: Ints
 
     def times(self, factor: int) -> Counter:
         """Return the counter with its energy multiplied."""

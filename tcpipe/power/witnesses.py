@@ -17,9 +17,8 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import WITNESSES_OF_LABEL, Finding, Severity, Subject, make_finding, read_threshold
 
@@ -67,7 +66,7 @@ def estimate_climb(
     velocity_mps: Floats,
     rise: Floats,
     mean_abs_yaw_rate_radps: Floats,
-    piece: NDArray[np.int64],
+    piece: Ints,
     mass_kg: float,
 ) -> Climb | None:
     """Fit power = a + b v + factor · m g sin(slope) v + c |yaw rate| to segments; None for fewer than 20, or on level ground.
@@ -96,7 +95,7 @@ def estimate_climb(
     return Climb(factor, std, float(np.corrcoef(slope[used], instrument[used])[0, 1]))
 
 
-def _average_neighbours(values: Floats, piece: NDArray[np.int64]) -> Floats:
+def _average_neighbours(values: Floats, piece: Ints) -> Floats:
     """Return the mean of the values two before and two behind in the same piece, shape (M,); NaN without either."""
     neighbours = np.full((2, len(values)), np.nan)
     shift = _INSTRUMENT_SHIFT
@@ -176,7 +175,7 @@ def estimate_missing_std_fraction(side_share: float | None) -> float:
     return (1.0 - 2.0 * share) / 3.0**0.5 if share < _MAX_HALF_SHARE else 0.0
 
 
-def compute_side_share(first_amp: Floats, second_amp: Floats, is_straight: NDArray[np.bool_]) -> float | None:
+def compute_side_share(first_amp: Floats, second_amp: Floats, is_straight: Mask) -> float | None:
     """Return the share of the first of two sides in their current in straight driving [1]; None for fewer than 30 rows.
 
     The currents [A], shape (N,), are positive when drawn. A share below 0.05 or above 0.95 shows that one whole side is not measured.

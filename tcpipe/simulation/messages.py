@@ -8,8 +8,8 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.formats.logs.writing import MessageStream
 from tcpipe.simulation.sensors import (
     Doppler,
@@ -79,7 +79,7 @@ def _make_stream(
     return MessageStream(topic, type_name, reading.log_time_ns, columns, fixed, publish_time_ns=reading.stamp_ns)
 
 
-def _make_vector(prefix: str, values: NDArray[np.float64], axes: str = "xyz") -> dict[str, NDArray[np.float64]]:
+def _make_vector(prefix: str, values: Floats, axes: str = "xyz") -> dict[str, Floats]:
     return {f"{prefix}.{axis}": values[:, i] for i, axis in enumerate(axes)}
 
 

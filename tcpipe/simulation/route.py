@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Bytes, Floats, Mask
 from tcpipe.errors import UsageError
 from tcpipe.geometry.rotation import invert, multiply, quat_from_matrix, rotation_vector_from_quat
 from tcpipe.simulation.robot import SimulatedRobot, compute_rolling_resistance, drive_along, make_correlated_noise
@@ -254,7 +253,7 @@ class Wander:
         done += length[best] * np.bincount(classes[best], minlength=256) / points
         return np.array([u[best, -1], v[best, -1]])
 
-    def _allowed(self, world: World, u: Floats, v: Floats) -> tuple[NDArray[np.bool_], NDArray[np.uint8], Floats]:
+    def _allowed(self, world: World, u: Floats, v: Floats) -> tuple[Mask, Bytes, Floats]:
         """Return which lines may be driven, the classes along them, and how steep they are on the whole (1: the steepest allowed)."""
         site, margin = world.site, self.margin_m
         west, east = self.x_range_m or (margin, site.width_m - margin)

@@ -13,9 +13,8 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.geometry.rotation import invert, multiply, quat_from_rotation_vector, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.simulation.robot import GRAVITY_MPS2, make_correlated_noise
 from tcpipe.simulation.truth import Truth
@@ -80,8 +79,8 @@ class Faults:
 class Reading:
     """Messages of one sensor, one a row."""
 
-    stamp_ns: NDArray[np.int64]
-    log_time_ns: NDArray[np.int64]
+    stamp_ns: Ints
+    log_time_ns: Ints
     values: Values
 
 
@@ -453,8 +452,8 @@ def read_joystick(truth: Truth, sensor: Joystick, faults: Faults, noise: Noise) 
 
 
 def _finish(
-    stamp: NDArray[np.int64], delay_s: float, values: Values, faults: Faults, noise: Noise, *,
-    name: str, keep: NDArray[np.bool_] | None = None,
+    stamp: Ints, delay_s: float, values: Values, faults: Faults, noise: Noise, *,
+    name: str, keep: Mask | None = None,
 ) -> Reading:  # fmt: skip
     """Return what is recorded: messages late by a delay with an exponential tail, without those not kept, some of them twice."""
     times = np.ones(stamp.size, np.int64) if keep is None else keep.astype(np.int64)
@@ -468,7 +467,7 @@ def _finish(
     return Reading(np.repeat(stamp, times), np.repeat(log_time, times), values)
 
 
-def _sample_times(truth: Truth, rate_hz: float, rng: np.random.Generator) -> NDArray[np.int64]:
+def _sample_times(truth: Truth, rate_hz: float, rng: np.random.Generator) -> Ints:
     period_ns = 1e9 / rate_hz
     times = np.arange(rng.uniform(0.0, period_ns), truth.stamp_ns[-1] - truth.stamp_ns[0], period_ns)
     return np.asarray(truth.stamp_ns[0] + np.round(times).astype(np.int64))
@@ -480,9 +479,7 @@ def _draw_begin_ns(truth: Truth, rng: np.random.Generator, length_s: float) -> i
     return int(truth.stamp_ns[0] + rng.uniform(0.25, 0.75) * max(span - length_s * 1e9, 0.0))
 
 
-def _remove_stretch(
-    stamp: NDArray[np.int64], truth: Truth, rng: np.random.Generator, length_s: float
-) -> NDArray[np.bool_]:
+def _remove_stretch(stamp: Ints, truth: Truth, rng: np.random.Generator, length_s: float) -> Mask:
     """Return which messages are left when some stretch of that length is missing."""
     begin = _draw_begin_ns(truth, rng, length_s)
     return (stamp < begin) | (stamp >= begin + round(length_s * 1e9))
@@ -494,18 +491,18 @@ def _dead_reckon(velocity: Floats, yaw_rate: Floats, dt_s: float) -> tuple[Float
     return np.cumsum(step_x) - step_x[0], np.cumsum(step_y) - step_y[0], (yaw + np.pi) % (2 * np.pi) - np.pi
 
 
-def _interpolate(values: Floats, truth: Truth, stamp: NDArray[np.int64]) -> Floats:
+def _interpolate(values: Floats, truth: Truth, stamp: Ints) -> Floats:
     return np.stack([np.interp(stamp, truth.stamp_ns, column) for column in values.T], axis=-1)
 
 
-def _make_wandering_bias(stamp: NDArray[np.int64], size: float, rng: np.random.Generator) -> Floats:
+def _make_wandering_bias(stamp: Ints, size: float, rng: np.random.Generator) -> Floats:
     """Return a constant of about ``size`` per axis that drifts by a fifth of it with a correlation time of 100 s, shape (N, 3)."""
     constant = size * np.sign(rng.standard_normal(3)) * rng.uniform(0.6, 1.2, 3)
     step_s = float(np.median(np.diff(stamp))) * 1e-9
     return constant + 0.2 * size * _make_lasting_noise(stamp.size, step_s / 100.0, rng)
 
 
-def _mean_before(truth: Truth, values: Floats, stamp: NDArray[np.int64], period_ns: int) -> Floats:
+def _mean_before(truth: Truth, values: Floats, stamp: Ints, period_ns: int) -> Floats:
     """Return the mean of a series over the period that ends at each stamp; of no period the value there."""
     if not period_ns:
         return np.interp(stamp, truth.stamp_ns, values)

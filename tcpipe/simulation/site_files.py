@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tcpipe import __version__
+from tcpipe.arrays import Floats
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.json_files import to_json, write_json
@@ -145,7 +145,7 @@ def _write_raster(
     world: World,
     pixel_size_m: float,
     shift_m: tuple[float, float],
-    pixels: Callable[[World, NDArray[np.float64], NDArray[np.float64]], Pixels],
+    pixels: Callable[[World, Floats, Floats], Pixels],
     **options: Any,
 ) -> None:
     site = world.site
@@ -160,17 +160,17 @@ def _write_raster(
     write_geotiff(path, strip, MapGrid(f"EPSG:{site.epsg}", west, north, pixel_size_m, rows, cols), **options)
 
 
-def _make_height_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
+def _make_height_pixels(world: World, x: Floats, y: Floats) -> Pixels:
     return np.where(world.mapped(x, y), world.mapped_height_m(x, y), _HEIGHT_NODATA).astype(np.float32)[None]
 
 
-def _make_ortho_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
+def _make_ortho_pixels(world: World, x: Floats, y: Floats) -> Pixels:
     mapped = world.mapped(x, y)
     rgb = np.where(mapped[..., None], np.clip(np.round(world.ortho(x, y)), 0, 255), 0)
     return np.concatenate([np.moveaxis(rgb, -1, 0), np.where(mapped, 255, 0)[None]]).astype(np.uint8)
 
 
-def _make_terrain_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
+def _make_terrain_pixels(world: World, x: Floats, y: Floats) -> Pixels:
     return np.where(world.mapped(x, y), 10 * world.terrain_class(x, y), 0).astype(np.uint8)[None]
 
 

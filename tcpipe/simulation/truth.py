@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Bytes, Floats, Ints
 from tcpipe.compiled import compile_kernel
 from tcpipe.geometry.rotation import normalize, rpy_from_quat
 
@@ -28,7 +28,7 @@ class Truth:
     The local plane is east, north, up of the site's datum; ``quat_xyzw`` is enu_from_base_link; velocities are of base_link.
     """
 
-    stamp_ns: NDArray[np.int64]
+    stamp_ns: Ints
     x_map_m: Floats
     y_map_m: Floats
     lon_deg: Floats
@@ -42,7 +42,7 @@ class Truth:
     wheel_velocity_mps: Floats
     slip: Floats
     slope_rad: Floats  # along base_link's x, positive uphill
-    terrain_class: NDArray[np.uint8]
+    terrain_class: Bytes
     command_velocity_mps: Floats
     command_yaw_rate_radps: Floats
     voltage_volt: Floats
@@ -52,7 +52,7 @@ class Truth:
     energy_joule: Floats  # since the start
     distance_m: Floats  # horizontal way since the start
 
-    def at(self, stamp_ns: NDArray[np.int64]) -> Truth:
+    def at(self, stamp_ns: Ints) -> Truth:
         """Return the truth at other times, linear between steps; beyond the ends it is held."""
         position = np.interp(stamp_ns, self.stamp_ns, np.arange(self.stamp_ns.size))
         low = np.minimum(position.astype(np.int64), self.stamp_ns.size - 2)
@@ -108,7 +108,7 @@ class TrueCost:
     arc_length_m: Floats
 
 
-def compute_true_cost(truth: Truth, start_ns: NDArray[np.int64], chord_m: float = 1.0) -> TrueCost:
+def compute_true_cost(truth: Truth, start_ns: Ints, chord_m: float = 1.0) -> TrueCost:
     """Return what the metre cost that begins where the robot truly was at ``start_ns``, shape (N,).
 
     It ends at the first crossing of the horizontal distance ``chord_m`` from there, found within a step by linear motion.

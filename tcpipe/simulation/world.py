@@ -12,11 +12,10 @@ from dataclasses import astuple, dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.special import erf
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Bytes, Floats, Mask
 from tcpipe.tables.facts import ABSENT
 
 _SEMI_MAJOR_M = 6378137.0
@@ -177,18 +176,18 @@ class Surface:
     map_noise_std_m: float  # of the height raster, which costs nothing
     swing: float  # by how much grain, bumps and ridges grow where their state is 1, as a fraction
 
-    def shade(self, classes: NDArray[np.uint8], u: Floats, v: Floats) -> Floats:
+    def shade(self, classes: Bytes, u: Floats, v: Floats) -> Floats:
         """Return what the brightness is multiplied with, at offsets from the site's corner [m]."""
         grain = 1.0 + self.swing * state(self.cover, u, v)
         grain *= self._by_class("grain")[classes] * evaluate_field(self.grain, u, v)
         return np.asarray((1.0 - self._by_class("wet_shade")[classes] * state(self.wetness, u, v)) * (1.0 + grain))
 
-    def resistance(self, classes: NDArray[np.uint8], u: Floats, v: Floats) -> Floats:
+    def resistance(self, classes: Bytes, u: Floats, v: Floats) -> Floats:
         """Return the rolling resistance that is added, as a fraction of the class's."""
         wet = self._by_class("wet_resistance")[classes] * state(self.wetness, u, v)
         return np.asarray(wet + self._by_class("cover_resistance")[classes] * state(self.cover, u, v))
 
-    def relief_m(self, classes: NDArray[np.uint8], u: Floats, v: Floats) -> Floats:
+    def relief_m(self, classes: Bytes, u: Floats, v: Floats) -> Floats:
         """Return the height of bumps and ridges [m]."""
         relief = self._by_class("bump_m")[classes] * evaluate_field(self.bumps, u, v)
         relief += self._by_class("ridge_m")[classes] * evaluate_field(self.ridges, u, v)
@@ -337,7 +336,7 @@ class World:
             gx, gy = gx + kx * rise, gy + ky * rise
         return gx, gy
 
-    def terrain_class(self, x_map_m: Floats, y_map_m: Floats) -> NDArray[np.uint8]:
+    def terrain_class(self, x_map_m: Floats, y_map_m: Floats) -> Bytes:
         """Return the class id, everywhere (the holes of the rasters do not matter here)."""
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         classes = np.full(np.broadcast_shapes(np.shape(u), np.shape(v)), GRASS, dtype=np.uint8)
@@ -362,7 +361,7 @@ class World:
             shade = shade * np.maximum(1.0 - (east * gx + north * gy) / up, 0.0) / np.sqrt(1.0 + gx**2 + gy**2)
         return rgb * shade[..., None]
 
-    def mapped(self, x_map_m: Floats, y_map_m: Floats) -> NDArray[np.bool_]:
+    def mapped(self, x_map_m: Floats, y_map_m: Floats) -> Mask:
         """Return whether the rasters hold data here."""
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         inside = (u >= 0) & (u <= self.site.width_m) & (v >= 0) & (v <= self.site.height_m)

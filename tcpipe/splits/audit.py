@@ -111,7 +111,7 @@ def compute_middles(ends: Sequence[NDArray[np.generic]]) -> Floats:
     return np.column_stack([(x0 + x1) / 2.0, (y0 + y1) / 2.0])
 
 
-def are_near(queries: Floats, references: Floats, *, within_m: float, in_degrees: bool) -> NDArray[np.bool_]:
+def are_near(queries: Floats, references: Floats, *, within_m: float, in_degrees: bool) -> Mask:
     """Return which of ``queries``, shape (N, 2), are at most so far from one of ``references``; NaN is near nothing.
 
     Both are lon, lat [deg] if ``in_degrees``, else x, y [m].

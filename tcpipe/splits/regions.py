@@ -16,7 +16,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Bytes, Floats, Mask
 
 Project = Callable[[Floats], Floats]
 Geometries = TypeVar("Geometries", BaseGeometry, NDArray[np.object_])
@@ -78,7 +78,7 @@ def project_near(geometry: Geometries, project: Project, window_deg: tuple[float
     return placed
 
 
-def classify_footprints(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDArray[np.uint8]:
+def classify_footprints(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> Bytes:
     """Return the `Side` of every footprint, shape (N,).
 
     Parameters
@@ -115,7 +115,7 @@ def _cut_lines(borders: BaseGeometry) -> NDArray[np.object_]:
     return np.asarray(shapely.linestrings(xy_m[at], indices=np.repeat(np.arange(len(first)), counts)))
 
 
-def _is_on_border(squares: NDArray[np.object_], borders: shapely.STRtree, *, buffer_m: float) -> NDArray[np.bool_]:
+def _is_on_border(squares: NDArray[np.object_], borders: shapely.STRtree, *, buffer_m: float) -> Mask:
     """Tell which squares a border runs through, or passes nearer than the buffer."""
     found = np.zeros(len(squares), np.bool_)
     if buffer_m > 0.0:

@@ -9,8 +9,8 @@ from itertools import chain
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.cost.labels import (
     Labels,
     SensorError,
@@ -87,7 +87,7 @@ def label_segments(
     """
     rule: Rule = "averaged" if streams.power_averaged else config.integration
     parts, joules = [LABELLED_SEGMENTS.empty()], Counter[str]()
-    variance_j2: list[dict[str, NDArray[np.float64]]] = []
+    variance_j2: list[dict[str, Floats]] = []
     epochs: list[int] = np.unique(to_integers(masked.table, "clock_epoch")).tolist()
     rails_by_epoch = {epoch: make_rails(streams, epoch) for epoch in epochs}
     power = audit_power_sensor(masked.table, rails_by_epoch, masked.info, config)
@@ -170,7 +170,7 @@ def compute_segment_costs(
     standing: IdlePower,
     sensor: SensorError,
     power: PowerSensorFacts,
-) -> tuple[Labels, dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
+) -> tuple[Labels, dict[str, Floats], dict[str, Floats]]:
     """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause [J²].
 
     ``cut`` and ``rows`` are the epoch's segments and rows of the masked track.
@@ -210,7 +210,7 @@ def compute_segment_costs(
     return cost, net, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise.std_joule()) ** 2}
 
 
-def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> NDArray[np.float64]:
+def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> Floats:
     """Return the error of each segment's displacement [m], shape (M,): the smoother's, else by the rows' standard deviations."""
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     duration_s = (end_ns - start_ns).astype(np.float64) * 1e-9
@@ -278,7 +278,7 @@ def make_fit_samples(table: pa.Table) -> FitSamples:
     )
 
 
-def fit_run_physics(table: pa.Table, idle_watt: float) -> tuple[NDArray[np.float64], PhysicsFacts]:
+def fit_run_physics(table: pa.Table, idle_watt: float) -> tuple[Floats, PhysicsFacts]:
     """Return the power [W] that speed, slope and turning of each segment need, NaN without a fit, and the fit of the run.
 
     The classes of the ground are unknown here: of mud in a meadow the residual is large, and shows no error.

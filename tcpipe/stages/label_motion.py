@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.cost.labels import (
     Labels,
     estimate_energy_budget,
@@ -36,7 +36,7 @@ from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo
 
-Arrays = dict[str, NDArray[np.float64]]
+Arrays = dict[str, Floats]
 
 _ROLLING_MPS = 0.05
 """Wheels slower than this are stationary: their slip is unknown."""
@@ -78,7 +78,7 @@ def _compute_turns(cut: pa.Table, rows: pa.Table, imu: pa.Table | None, info: Tr
     }
 
 
-def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> NDArray[np.float64]:
+def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> Floats:
     """Return how fast the variance of a yaw change grows [rad²/s], shape (M,): over a metre the gyroscope alone determines it.
 
     NaN without a gyroscope, and in a forward filter, whose yaw moves with every measurement.
@@ -109,7 +109,7 @@ def _compute_slip(cut: pa.Table, rows: pa.Table, cost: Labels) -> Arrays:
     return {"slip_fraction": 1.0 - ratio, "slip_std_fraction": np.abs(ratio) * relative}
 
 
-def _compute_vibration(imu: pa.Table | None, start_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> Arrays:
+def _compute_vibration(imu: pa.Table | None, start_ns: Ints, end_ns: Ints) -> Arrays:
     """Return the vibration and its standard deviation; NaN without an IMU that measures the specific force with gravity."""
     found = np.full(len(start_ns), np.nan), np.full(len(start_ns), np.nan)
     if imu is not None:
@@ -121,7 +121,7 @@ def _compute_vibration(imu: pa.Table | None, start_ns: NDArray[np.int64], end_ns
     return dict(zip(("vibration_mps2", "vibration_std_mps2"), found, strict=True))
 
 
-Flags = dict[Quality, NDArray[np.bool_]]
+Flags = dict[Quality, Mask]
 
 
 def find_power_flags(cut: pa.Table, rails: list[Rail], *, range_volt: tuple[float, float] | None) -> Flags:
@@ -160,7 +160,7 @@ def find_motion_flags(
     }
 
 
-def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
+def _find_disputed(cut: pa.Table, info: TrackInfo) -> Mask:
     """Return the segments of one epoch that touch a time in which sensors disagree.
 
     Fixes were off the track, or the estimate of the whole section does not explain its sensors.
@@ -182,11 +182,11 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
     return disputed
 
 
-def _find_gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:
+def _find_gap_edges(rows: pa.Table, rate_hz: float) -> Mask:
     """Return the rows that are in a gap, or beside a hole."""
     piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
     hole = np.diff(piece) != 0
-    edge: NDArray[np.bool_] = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.GAP)) != 0
+    edge: Mask = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.GAP)) != 0
     edge[:-1] |= hole
     edge[1:] |= hole
     return edge
@@ -214,7 +214,7 @@ def make_label_facts(
     rails: Mapping[int, list[Rail]],
     energy_by_entry_joule: Mapping[str, float],
     distance_by_reason_m: Mapping[str, float],
-    energy_variance_j2: Sequence[Mapping[str, NDArray[np.float64]]],
+    energy_variance_j2: Sequence[Mapping[str, Floats]],
     *,
     rule: Rule,
     velocity: str,
@@ -253,9 +253,7 @@ def make_label_facts(
     )
 
 
-def _make_budget(
-    energy_joule: NDArray[np.float64], variance_j2: Sequence[Mapping[str, NDArray[np.float64]]]
-) -> EnergyBudget | None:
+def _make_budget(energy_joule: Floats, variance_j2: Sequence[Mapping[str, Floats]]) -> EnergyBudget | None:
     if not variance_j2:
         return None
     return estimate_energy_budget(
@@ -295,12 +293,12 @@ def _find_low_rate(facts: LabelFacts, rails: Iterable[Rail]) -> Finding:
     return make_finding("power-too-slow", _POWER, names={"quantity": quantity}, rate_hz=rate_hz, wanted_hz=wanted_hz)
 
 
-def _compute_share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_share(part: Floats, whole: Floats) -> Floats:
     """Return a part of each value; NaN where the value is zero (no current, no energy)."""
     return np.divide(part, whole, out=np.full_like(part, np.nan), where=whole != 0.0)
 
 
-def _compute_median(values: NDArray[np.float64]) -> float | None:
+def _compute_median(values: Floats) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.median(np.abs(known))) if len(known) else None
 
@@ -321,7 +319,7 @@ def sum_energy_entries(rows: pa.Table, rails: list[Rail], *, rate_hz: float, rul
 
 
 def _integrate_whole_record(rails: list[Rail], rule: Rule) -> float:
-    stamps: list[NDArray[np.int64]] = [each.stamp_ns[[0, -1]] for each in rails if len(each.stamp_ns)]
+    stamps: list[Ints] = [each.stamp_ns[[0, -1]] for each in rails if len(each.stamp_ns)]
     if not stamps:
         return 0.0
     ends = np.sort(np.concatenate(stamps))

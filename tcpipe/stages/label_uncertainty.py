@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.cost.labels import SensorError
 from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
 from tcpipe.motion.row_sections import find_runs, number_pieces
@@ -43,7 +43,7 @@ from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshol
 from tcpipe.tables.levels import Streams, TrackInfo
 
 
-def find_stationary_ns(rows: pa.Table, rate_hz: float, *, but: int = 0) -> NDArray[np.int64]:
+def find_stationary_ns(rows: pa.Table, rate_hz: float, *, but: int = 0) -> Ints:
     """Return begin and end [ns] of every span in which the robot is stationary, and not in another way, shape (S, 2)."""
     stamp_ns = to_integers(rows, "stamp_ns")
     piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
@@ -278,7 +278,7 @@ def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts)
     return count
 
 
-def _touches(spans: list[tuple[int, int]], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _touches(spans: list[tuple[int, int]], start_ns: Ints, end_ns: Ints) -> Mask:
     """Return the segments that touch any of the spans, shape (M,)."""
     touched = np.zeros(len(start_ns), dtype=np.bool_)
     for first_ns, last_ns in spans:

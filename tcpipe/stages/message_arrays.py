@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.measurements import GNSS, POSE
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.logs.extrinsics import Transforms
@@ -69,7 +70,7 @@ def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> Arra
     return found
 
 
-def _read_nested(lists: pa.Array, path: list[str]) -> NDArray[np.float64] | None:
+def _read_nested(lists: pa.Array, path: list[str]) -> Floats | None:
     """Return a number of every message in lists of messages, shape (N, k); None where there is no such number."""
     kind = lists.type.value_type if _is_list(lists.type) else pa.null()
     for name in path:
@@ -105,18 +106,18 @@ def _is_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
 
 
-def _make_matrix(lists: pa.Array) -> NDArray[np.float64]:
+def _make_matrix(lists: pa.Array) -> Floats:
     if pa.types.is_fixed_size_list(lists.type):
-        values: NDArray[np.float64] = to_numbers(pc.list_flatten(lists)).astype(np.float64, copy=False)
+        values: Floats = to_numbers(pc.list_flatten(lists)).astype(np.float64, copy=False)
         return values.reshape(len(lists), lists.type.list_size)
     return _fill_nulls(to_numbers(pc.list_value_length(lists)).astype(np.int64), pc.list_flatten(lists))
 
 
-def _fill_nulls(lengths: NDArray[np.int64], flat: pa.Array) -> NDArray[np.float64]:
+def _fill_nulls(lengths: Ints, flat: pa.Array) -> Floats:
     return _fill_rows(lengths, to_numbers(flat).astype(np.float64, copy=False), np.nan)
 
 
-def _fill_rows(lengths: NDArray[np.int64], values: NDArray[T], empty: float | str) -> NDArray[T]:
+def _fill_rows(lengths: Ints, values: NDArray[T], empty: float | str) -> NDArray[T]:
     """Return values of lists, one after the other, as a row a list, shape (N, k); ``empty`` where one is shorter than the longest."""
     if len(lengths) and lengths.min() == lengths.max():
         return values.reshape(len(lengths), int(lengths[0]))
@@ -133,7 +134,7 @@ def read_transforms(table: pa.Table) -> Transforms:
         found: list[str] = pc.struct_field(flat, list(path)).to_pylist()
         return found
 
-    def vectors(name: str, components: str) -> NDArray[np.float64]:
+    def vectors(name: str, components: str) -> Floats:
         parts = [pc.struct_field(flat, ["transform", name, component]) for component in components]
         return np.stack([to_numbers(part).astype(np.float64) for part in parts], -1)
 

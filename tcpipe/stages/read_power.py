@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.logs.field_mapping import Columns
 from tcpipe.logs.messages import LOG_TIME, Readings, read_header_ns
 from tcpipe.logs.roles import RoleAssignment
@@ -135,9 +135,7 @@ def select_power_rows(columns: Columns, rails: Sequence[RailReadings]) -> Readin
     )
 
 
-def read_rail_power(
-    rail: RailReadings, times: Columns, columns: Columns
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_rail_power(rail: RailReadings, times: Columns, columns: Columns) -> tuple[Floats, Floats]:
     """Return a rail's voltages [V] and currents [A] in its topic's readings.
 
     Those of a counter of energy are means by the times that rule; none across a reset or a step of the clock.
@@ -182,7 +180,7 @@ def add_averaging(
 _ASSUMED = "power-averaging-assumed"
 
 
-def _compute_power_at_currents(rail: pa.Table) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _compute_power_at_currents(rail: pa.Table) -> tuple[Ints, Floats]:
     """Return the stamps [ns] of a rail's currents and its power there [W]: its voltage may come at other times."""
     stamp_ns, voltage, current = (
         to_integers(rail, "stamp_ns"),
@@ -198,7 +196,7 @@ def _compute_power_at_currents(rail: pa.Table) -> tuple[NDArray[np.int64], NDArr
     )
 
 
-def _test_by_motion(power_ns: NDArray[np.int64], watt: NDArray[np.float64], motion: pa.Table) -> bool | None:
+def _test_by_motion(power_ns: Ints, watt: Floats, motion: pa.Table) -> bool | None:
     twist = np.column_stack([to_floats(motion, name) for name in ("velocity_x_mps", "angular_velocity_z_radps")])
     moving = np.isfinite(twist).all(axis=1)
     return is_stated_averaged(power_ns, watt, to_integers(motion, "stamp_ns")[moving], *twist[moving].T)
@@ -209,7 +207,7 @@ _BETWEEN_EPOCHS_NS = 1_000_000_000_000
 """Their stamps may overlap; no reading lasts as long."""
 
 Streams = dict[str, pa.Table]
-Values = Mapping[str, NDArray[np.float64]]
+Values = Mapping[str, Floats]
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,9 +251,7 @@ def remove_repeats(streams: Streams) -> tuple[Streams, list[RepeatedValues]]:
     return {**streams, "power": table}, repeats
 
 
-def _find_readings(
-    at_ns: NDArray[np.int64], own: NDArray[np.int64], quantity: str, values: Values
-) -> NDArray[np.int64] | None:
+def _find_readings(at_ns: Ints, own: Ints, quantity: str, values: Values) -> Ints | None:
     """Return the rows of a quantity's readings, by its own changes or, where these hardly show, by those of the other on the same rows."""
     found = find_readings(at_ns[own], values[quantity][own, None])
     if found is None and all(np.isfinite(value[own]).all() for value in values.values()):
@@ -263,7 +259,7 @@ def _find_readings(
     return None if found is None else own[found]
 
 
-def _rate_hz(at_ns: NDArray[np.int64]) -> float:
+def _rate_hz(at_ns: Ints) -> float:
     step_ns = np.diff(at_ns)
     return 1e9 / float(np.mean(step_ns[step_ns < 1.5 * np.median(step_ns)]))
 

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Bytes, Floats, Ints
 from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
 from tcpipe.recipe.suggestions import suggest
@@ -45,12 +46,12 @@ class Sampled:
     Where pixels wait in files, those of ``patches`` are empty.
     """
 
-    kept: NDArray[np.int64]
-    map_index: NDArray[np.uint8]
+    kept: Ints
+    map_index: Bytes
     patches: Patches
-    position_std_m: NDArray[np.float64]
-    footprint_xy_m: NDArray[np.float64]
-    footprint_lonlat_deg: NDArray[np.float64]
+    position_std_m: Floats
+    footprint_xy_m: Floats
+    footprint_lonlat_deg: Floats
     lost_by: NDArray[np.uint32]
     findings: tuple[Finding, ...]
 
@@ -153,7 +154,7 @@ _FRAME_STEP_M = 100.0
 """Local frames are moved by multiples of it: blocks of the split stay whole if they are of 1, 2, 5, 10, 20, 25 or 50 m."""
 
 
-def separate_frames(frame: NDArray[np.integer], ends_xy_m: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+def separate_frames(frame: NDArray[np.integer], ends_xy_m: Sequence[Floats]) -> list[Floats]:
     """Return points of local frames in one plane [m], each shape (N, 2): a later frame begins behind the earlier ones along x.
 
     ``frame`` is the number of each point's frame, shape (N,).
@@ -167,9 +168,7 @@ def separate_frames(frame: NDArray[np.integer], ends_xy_m: Sequence[NDArray[np.f
     return [points + np.stack([_FRAME_STEP_M * steps[frame], np.zeros(len(frame))], axis=1) for points in ends_xy_m]
 
 
-def _find_losses(
-    patches: Patches, corners: NDArray[np.float64], source: MapReader, config: SampleConfig
-) -> NDArray[np.uint32]:
+def _find_losses(patches: Patches, corners: Floats, source: MapReader, config: SampleConfig) -> NDArray[np.uint32]:
     lost = np.zeros(patches.valid_fraction.size, np.uint32)
     if "terrain" in patches.pixels:
         lost[~source.classes.traversable()[patches.terrain_class]] = Loss.NOT_TRAVERSABLE
@@ -180,7 +179,7 @@ def _find_losses(
     return lost
 
 
-def sum_losses(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) -> dict[Loss, float]:
+def sum_losses(arc_length_m: Floats, lost_by: NDArray[np.uint32]) -> dict[Loss, float]:
     """Return metres driven by what they are lost to."""
     return {loss: float(arc_length_m[lost_by == loss].sum()) for loss in _LOSSES}
 
@@ -242,7 +241,7 @@ def sample_on_maps(
     return Sampled(patches=join_patches([part.patches for part in parts]), lost_by=lost_by, findings=findings, **joined)
 
 
-def _project_to_first_map(sampled: Sampled, source: MapReader, first: MapReader) -> NDArray[np.float64]:
+def _project_to_first_map(sampled: Sampled, source: MapReader, first: MapReader) -> Floats:
     """Return footprints in the CRS of the first map [m], in which splits are drawn and distances measured."""
     if source.grid.crs == first.grid.crs:
         return sampled.footprint_xy_m

@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.errors import TableError
 from tcpipe.tables.bits import flag_name
 
@@ -77,7 +78,7 @@ _POINT, _LINE_STRING = 1, 2
 _LITTLE_ENDIAN = 1
 
 
-def make_lines(start_deg: NDArray[np.float64], end_deg: NDArray[np.float64]) -> pa.Array:
+def make_lines(start_deg: Floats, end_deg: Floats) -> pa.Array:
     """Return the straight lines between points x, y, shape (N, 2) each, as LineStrings; null where an end is not known (NaN)."""
     ends = np.unwrap(np.stack([start_deg, end_deg], axis=1), axis=1, period=360.0)  # short on the date line too
     rows = np.zeros(len(ends), [("order", "u1"), ("kind", "<u4"), ("points", "<u4"), ("xy", "<f8", (2, 2))])
@@ -85,7 +86,7 @@ def make_lines(start_deg: NDArray[np.float64], end_deg: NDArray[np.float64]) -> 
     return _make_column(rows)
 
 
-def make_points(xy_deg: NDArray[np.float64]) -> pa.Array:
+def make_points(xy_deg: Floats) -> pa.Array:
     """Return points x, y, shape (N, 2), as Points; null where one is not known (NaN)."""
     rows = np.zeros(len(xy_deg), [("order", "u1"), ("kind", "<u4"), ("xy", "<f8", (2,))])
     rows["order"], rows["kind"], rows["xy"] = _LITTLE_ENDIAN, _POINT, xy_deg
@@ -187,25 +188,25 @@ class TableSchema:
                 yield f"table {self.name}: column {name} is not in its schema"
 
 
-def to_floats(table: pa.Table, name: str) -> NDArray[np.float64]:
+def to_floats(table: pa.Table, name: str) -> Floats:
     """Return a column as float64, null as NaN, shape (N,)."""
-    values: NDArray[np.float64] = to_numbers(table.column(name)).astype(np.float64, copy=False)
+    values: Floats = to_numbers(table.column(name)).astype(np.float64, copy=False)
     return values
 
 
-def read_lonlat_deg(table: pa.Table, end: str) -> NDArray[np.float64]:
+def read_lonlat_deg(table: pa.Table, end: str) -> Floats:
     """Return longitude and latitude of the ``start`` or ``end`` of segments [deg], null as NaN, shape (N, 2)."""
     return np.stack([to_floats(table, f"{end}_{axis}_deg") for axis in ("lon", "lat")], axis=1)
 
 
-def read_float_columns(table: pa.Table) -> dict[str, NDArray[np.float64]]:
+def read_float_columns(table: pa.Table) -> dict[str, Floats]:
     """Return the columns of floating-point numbers by name, as `to_floats`."""
     return {field.name: to_floats(table, field.name) for field in table.schema if pa.types.is_floating(field.type)}
 
 
-def to_integers(table: pa.Table, name: str) -> NDArray[np.int64]:
+def to_integers(table: pa.Table, name: str) -> Ints:
     """Return a column without nulls as int64, shape (N,)."""
-    values: NDArray[np.int64] = to_numbers(table.column(name)).astype(np.int64, copy=False)
+    values: Ints = to_numbers(table.column(name)).astype(np.int64, copy=False)
     return values
 
 

@@ -24,6 +24,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Bytes, Floats, Floats32, Mask
 from tcpipe.tables.facts import LEFT_OUT
 
 NODATA_ID = 0
@@ -66,7 +67,7 @@ class ClassTable:
             names[entry.id] = entry.name
         return np.array(names)
 
-    def traversable(self) -> NDArray[np.bool_]:
+    def traversable(self) -> Mask:
         """Return whether each id may be driven over, shape (256,)."""
         found = np.zeros(MAX_ID + 1, np.bool_)
         for entry in self.classes:
@@ -95,7 +96,7 @@ class ClassScheme:
     table: ClassTable
     id_by_value: Mapping[int, int]
 
-    def ids(self, values: NDArray[np.integer], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    def ids(self, values: NDArray[np.integer], valid: Mask) -> Bytes:
         """Return class ids of raster values of any integer type and shape; 0 where not ``valid`` or not named."""
         known = np.array(sorted(self.id_by_value), np.int64)
         id_of = np.array([self.id_by_value[int(value)] for value in known], np.uint8)
@@ -207,7 +208,7 @@ class Layer:
     classes: ClassTable | None = None
     """Class table of a categorical layer."""
 
-    def compute_means(self, pixels: Pixels) -> NDArray[np.float64]:
+    def compute_means(self, pixels: Pixels) -> Floats:
         """Return the mean of stored patches, or the share of each class, shape (N, 1 or classes); without data: 0."""
         if self.classes is not None:
             ids = np.arange(1, self.classes.count + 1)
@@ -233,12 +234,12 @@ class Layer:
             return "greys" if self.mapped == np.uint8 else "floats"
         return "relative" if self.kind == "relative" else "classes"
 
-    def has_data(self, pixels: Pixels) -> NDArray[np.bool_]:
+    def has_data(self, pixels: Pixels) -> Mask:
         """Return which pixels of the map have data."""
         return np.isfinite(pixels) if self.mapped.kind == "f" else np.asarray(pixels != 0)
 
     @property
-    def channel_of_bytes(self) -> NDArray[np.float32]:
+    def channel_of_bytes(self) -> Floats32:
         """Return what each byte of a layer of bytes becomes in the tensor, in [0, 1], shape (256,)."""
         one = np.float32
         above = np.maximum(np.arange(256, dtype=one) - one(self.low / self.step), one(0.0))

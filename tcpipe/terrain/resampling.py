@@ -15,8 +15,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Bytes, Floats, Ints
 from tcpipe.compiled import compile_kernel
 from tcpipe.terrain.layers import Layer, Pixels
 from tcpipe.terrain.target_grid import LATTICE_STEP_PX, MapGrid
@@ -26,7 +26,7 @@ SNAP_PX = 1e-4
 
 
 @compile_kernel
-def _position(lattice: NDArray[np.float64], row: float, col: float) -> tuple[float, float]:
+def _position(lattice: Floats, row: float, col: float) -> tuple[float, float]:
     i, j = row / LATTICE_STEP_PX + 1.0, col / LATTICE_STEP_PX + 1.0
     a, b = min(int(i), lattice.shape[0] - 2), min(int(j), lattice.shape[1] - 2)
     v, u = i - a, j - b
@@ -40,7 +40,7 @@ def _position(lattice: NDArray[np.float64], row: float, col: float) -> tuple[flo
 
 
 @compile_kernel
-def resample_bilinear(source: NDArray[np.float64], lattice: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+def resample_bilinear(source: Floats, lattice: Floats, out: Floats) -> None:
     """Interpolate ``source`` (NaN: no data), shape (H, W), at every pixel of ``out``; NaN where a tap has no data or lies outside."""
     rows, cols = source.shape
     for i in range(out.shape[0]):
@@ -63,7 +63,7 @@ def resample_bilinear(source: NDArray[np.float64], lattice: NDArray[np.float64],
 
 
 @compile_kernel
-def mean(source: NDArray[np.float64], lattice: NDArray[np.float64], parts: int, out: NDArray[np.float64]) -> None:
+def mean(source: Floats, lattice: Floats, parts: int, out: Floats) -> None:
     """Average ``source`` (NaN: no data) over every pixel of ``out``, taken at parts x parts points; NaN where any has no data."""
     rows, cols = source.shape
     for i in range(out.shape[0]):
@@ -78,7 +78,7 @@ def mean(source: NDArray[np.float64], lattice: NDArray[np.float64], parts: int, 
 
 
 @compile_kernel
-def _vote(votes: NDArray[np.int64], found: int, best: int) -> int:
+def _vote(votes: Ints, found: int, best: int) -> int:
     """Count a vote; return the commonest class, the lower of two."""
     votes[found] += 1
     more = votes[found] - votes[best]
@@ -86,9 +86,7 @@ def _vote(votes: NDArray[np.int64], found: int, best: int) -> int:
 
 
 @compile_kernel
-def resample_majority(
-    source: NDArray[np.uint8], lattice: NDArray[np.float64], parts: int, out: NDArray[np.uint8]
-) -> None:
+def resample_majority(source: Bytes, lattice: Floats, parts: int, out: Bytes) -> None:
     """Take the commonest class over every pixel of ``out`` at parts x parts points (1: nearest); 0 is no data and votes; ties go low."""
     rows, cols = source.shape
     votes = np.zeros(256, np.int64)
@@ -109,7 +107,7 @@ def resample_majority(
 
 
 @compile_kernel
-def reduce_majority(ids: NDArray[np.uint8], factor: int, out: NDArray[np.uint8]) -> None:
+def reduce_majority(ids: Bytes, factor: int, out: Bytes) -> None:
     """Take the commonest class of every whole ``factor`` x ``factor`` block of ``ids``; 0 is no data and votes; ties go low."""
     votes = np.zeros(256, np.int64)
     for i in range(out.shape[0]):

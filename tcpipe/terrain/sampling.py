@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Bytes, Floats, Ints, Mask
 from tcpipe.errors import TableError
 from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M, STACKS, group_stacks
@@ -29,7 +29,7 @@ from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_tile, read_tile_window
 
 
-def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
+def compute_relief_m(height: NDArray[np.uint16]) -> Floats:
     """Return the largest difference of the stored heights of patches, shape (N, px, px), without data left out [m], shape (N,)."""
     steps = np.where(height == HEIGHT_NODATA, np.uint16(0), height).max(axis=(1, 2), initial=np.uint16(0))
     return np.asarray(steps * HEIGHT_STEP_M)
@@ -50,20 +50,20 @@ class Patches:
     """
 
     pixels: Mapping[str, NDArray[Any]]
-    height_min_m: NDArray[np.float64]
-    slope_rad: NDArray[np.float64]
-    cross_slope_rad: NDArray[np.float64]
-    valid_fraction: NDArray[np.float64]
-    height_clipped_fraction: NDArray[np.float64]
-    terrain_class: NDArray[np.uint8]
-    terrain_purity: NDArray[np.float64]
-    profile_m: NDArray[np.float64]
+    height_min_m: Floats
+    slope_rad: Floats
+    cross_slope_rad: Floats
+    valid_fraction: Floats
+    height_clipped_fraction: Floats
+    terrain_class: Bytes
+    terrain_purity: Floats
+    profile_m: Floats
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return all but the pixels, by name."""
         return {entry.name: getattr(self, entry.name) for entry in fields(self)[1:]}
 
-    def keep_valid(self, good: NDArray[np.bool_]) -> Patches:
+    def keep_valid(self, good: Mask) -> Patches:
         """Return the good patches, in their order; their pixels move in place, so do not use these patches afterwards."""
         rising = np.flatnonzero(good)
         for layer, first in product(self.pixels.values(), range(0, len(rising), _MOVED_ROWS)):
@@ -85,7 +85,7 @@ def join_patches(parts: Sequence[Patches]) -> Patches:
 def sample_patches(
     source: MapReader,
     frames: PatchFrames,
-    chord_m: NDArray[np.float64],
+    chord_m: Floats,
     *,
     patch_m: float,
     patch_px: int,
@@ -137,9 +137,7 @@ def _compute_profile(height: NDArray[np.uint16]) -> Floats:
     return np.stack([along_m[:, part].mean(axis=1) for part in (slice(1), middle, slice(-1, None))], axis=1)
 
 
-def _compute_boxes(
-    pixels: NDArray[np.float64], patch_px: int, chords: NDArray[np.float64], points: int
-) -> NDArray[np.int64]:
+def _compute_boxes(pixels: Floats, patch_px: int, chords: Floats, points: int) -> Ints:
     """Return the map pixels that each patch and its chord touch: first row and column, last row and column (exclusive), (N, 4)."""
     first, along, down = pixels[:, :2], pixels[:, 2:4] * (patch_px - 1), pixels[:, 4:6] * (patch_px - 1)
     begin, end = chords[:, :2], chords[:, :2] + chords[:, 2:] * (points - 1)
@@ -152,7 +150,7 @@ OFF_THE_MAP = -1
 """Instead of a class id where a point is not on the map."""
 
 
-def find_classes_at(source: MapReader, xy_m: NDArray[np.float64]) -> NDArray[np.int16]:
+def find_classes_at(source: MapReader, xy_m: Floats) -> NDArray[np.int16]:
     """Return the class id under each point, 0 without data, `OFF_THE_MAP` where the map ends, shape (N,).
 
     Parameters
@@ -184,7 +182,7 @@ class PatchFrames:
     along_xy: Floats
     left_xy: Floats
 
-    def rows(self, chosen: NDArray[np.int64]) -> PatchFrames:
+    def rows(self, chosen: Ints) -> PatchFrames:
         """Return the chosen frames, in their order."""
         return PatchFrames(self.centre_xy_m[chosen], self.along_xy[chosen], self.left_xy[chosen])
 
@@ -213,7 +211,7 @@ def compute_footprints(frames: PatchFrames, patch_m: float) -> Floats:
     return corners
 
 
-def count_corners_on(grid: MapGrid, footprint_xy_m: Floats) -> NDArray[np.int64]:
+def count_corners_on(grid: MapGrid, footprint_xy_m: Floats) -> Ints:
     """Return how many corners of each footprint, shape (N, 4, 2), lie on the map, shape (N,)."""
     return np.asarray(np.count_nonzero(grid.contains(footprint_xy_m), axis=1))
 

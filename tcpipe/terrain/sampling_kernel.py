@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Bytes, Floats, Floats32, Ints, Mask
 from tcpipe.compiled import compile_kernel
 from tcpipe.terrain.layers import HEIGHT_NODATA
 
@@ -25,10 +26,10 @@ class Tiles(NamedTuple):
     without data; ``rows`` and ``cols`` are the pixels of a tile.
     """
 
-    relative: NDArray[np.float32]
-    floats: NDArray[np.float32]
-    greys: NDArray[np.uint8]
-    classes: NDArray[np.uint8]
+    relative: Floats32
+    floats: Floats32
+    greys: Bytes
+    classes: Bytes
     slots: NDArray[np.int32]
     rows: int
     cols: int
@@ -44,9 +45,9 @@ class Ground(NamedTuple):
     heights [m].
     """
 
-    boxes: NDArray[np.int64]
-    frames: NDArray[np.float64]
-    chords: NDArray[np.float64]
+    boxes: Ints
+    frames: Floats
+    chords: Floats
     chord_points: int
     classed: int
     pixel_size_m: float
@@ -62,10 +63,10 @@ class Stacks(NamedTuple):
     """
 
     relative: NDArray[np.uint16]
-    floats: NDArray[np.float32]
-    greys: NDArray[np.uint8]
-    classes: NDArray[np.uint8]
-    stats: NDArray[np.float64]
+    floats: Floats32
+    greys: Bytes
+    classes: Bytes
+    stats: Floats
 
 
 class _Taps(NamedTuple):
@@ -76,13 +77,13 @@ class _Taps(NamedTuple):
     """
 
     at: NDArray[np.uint64]
-    fx: NDArray[np.float32]
-    fy: NDArray[np.float32]
-    good: NDArray[np.bool_]
+    fx: Floats32
+    fy: Floats32
+    good: Mask
 
 
 @compile_kernel
-def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: Stacks) -> None:
+def sample_tiles(tiles: Tiles, ground: Ground, chosen: Ints, out: Stacks) -> None:
     """Sample patches from tiles that are in memory; ``chosen`` are those rows of ``ground`` and ``out``, shape (n,)."""
     side, most = out.relative.shape[1], 0
     for n in chosen:
@@ -140,7 +141,7 @@ def _take_layer(stack: NDArray[np.generic], number: int, tiles: Tiles) -> NDArra
 
 @compile_kernel
 def _copy_window(
-    layer: NDArray[np.generic], tiles: Tiles, box: NDArray[np.int64], blank: np.generic, window: NDArray[np.generic]
+    layer: NDArray[np.generic], tiles: Tiles, box: Ints, blank: np.generic, window: NDArray[np.generic]
 ) -> None:
     """Copy a box of a layer from one or more tiles, row by row; ground without a tile is blank."""
     slots, high, wide = tiles.slots, tiles.rows, tiles.cols
@@ -157,7 +158,7 @@ def _copy_window(
 
 
 @compile_kernel
-def _find_taps(box: NDArray[np.int64], frame: NDArray[np.float64], side: int, taps: _Taps) -> None:
+def _find_taps(box: Ints, frame: Floats, side: int, taps: _Taps) -> None:
     """Find the window's pixels that each patch pixel lies between; all are valid."""
     at, fx, fy, good = taps
     good[:] = True
@@ -173,7 +174,7 @@ def _find_taps(box: NDArray[np.int64], frame: NDArray[np.float64], side: int, ta
 
 
 @compile_kernel
-def _sample_floats(window: NDArray[np.float32], width: int, taps: _Taps, out: NDArray[np.float32]) -> None:
+def _sample_floats(window: Floats32, width: int, taps: _Taps, out: Floats32) -> None:
     at, fx, fy, good = taps
     one, stride = np.uint64(1), np.uint64(width)
     for k in range(np.uint64(out.size)):
@@ -185,7 +186,7 @@ def _sample_floats(window: NDArray[np.float32], width: int, taps: _Taps, out: ND
 
 
 @compile_kernel
-def _sample_greys(window: NDArray[np.uint8], width: int, taps: _Taps, out: NDArray[np.uint8]) -> None:
+def _sample_greys(window: Bytes, width: int, taps: _Taps, out: Bytes) -> None:
     at, fx, fy, good = taps
     one, stride = np.uint64(1), np.uint64(width)
     for k in range(np.uint64(out.size)):
@@ -198,7 +199,7 @@ def _sample_greys(window: NDArray[np.uint8], width: int, taps: _Taps, out: NDArr
 
 
 @compile_kernel
-def _sample_classes(window: NDArray[np.uint8], width: int, taps: _Taps, out: NDArray[np.uint8]) -> None:
+def _sample_classes(window: Bytes, width: int, taps: _Taps, out: Bytes) -> None:
     at, fx, fy, good = taps
     half = np.float32(0.5)
     for k in range(np.uint64(out.size)):
@@ -207,9 +208,7 @@ def _sample_classes(window: NDArray[np.uint8], width: int, taps: _Taps, out: NDA
 
 
 @compile_kernel
-def _store_height(
-    rise: NDArray[np.float32], good: NDArray[np.bool_], step_m: float, out: NDArray[np.uint16]
-) -> tuple[np.float32, int]:
+def _store_height(rise: Floats32, good: Mask, step_m: float, out: NDArray[np.uint16]) -> tuple[np.float32, int]:
     """Store valid heights in steps above the smallest; return that, 0 of none, and how many lie more than a metre above it."""
     lowest, clipped = np.float32(np.inf), 0
     for k in range(np.uint64(rise.size)):
@@ -224,7 +223,7 @@ def _store_height(
 
 
 @compile_kernel
-def _clear(out: Stacks, n: int, good: NDArray[np.bool_]) -> None:
+def _clear(out: Stacks, n: int, good: Mask) -> None:
     """Take the data of a patch where any layer lacks it."""
     for k in range(good.size):
         if not good[k]:
@@ -235,7 +234,7 @@ def _clear(out: Stacks, n: int, good: NDArray[np.bool_]) -> None:
 
 
 @compile_kernel
-def _fit_slopes(rise: NDArray[np.float32], good: NDArray[np.bool_], side: int) -> tuple[float, float]:
+def _fit_slopes(rise: Floats32, good: Mask, side: int) -> tuple[float, float]:
     """Return the fitted plane's rise for one pixel along and one to the left, by valid pixels; 0 where they do not span a plane."""
     middle = 0.5 * (side - 1)
     count = su = sv = suu = suv = svv = sh = suh = svh = 0.0
@@ -264,12 +263,12 @@ def _fit_slopes(rise: NDArray[np.float32], good: NDArray[np.bool_], side: int) -
 
 @compile_kernel
 def _find_class_under(
-    near: NDArray[np.uint8],
+    near: Bytes,
     width: int,
-    box: NDArray[np.int64],
-    chord: NDArray[np.float64],
+    box: Ints,
+    chord: Floats,
     points: int,
-    votes: NDArray[np.int64],
+    votes: Ints,
 ) -> tuple[int, float]:
     """Return the commonest class at points on the chord and its share of those that have one; ties go low."""
     votes[:] = 0
@@ -282,7 +281,7 @@ def _find_class_under(
 
 
 @compile_kernel
-def compute_morton(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
+def compute_morton(x: Ints, y: Ints) -> Ints:
     """Return positions on the Z-order curve of non-negative integer cells, shape (N,): neighbours stay near."""
     code = np.empty(x.size, np.int64)
     for n in range(x.size):

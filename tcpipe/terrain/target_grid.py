@@ -17,10 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Mask
 from tcpipe.errors import MapError
 from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, is_metric
 
@@ -226,21 +225,21 @@ class MapGrid:
         """GDAL's six numbers: x min, dx/dcol, dx/drow, y max, dy/dcol, dy/drow."""
         return (self.x_min_m, self.pixel_size_m, 0.0, self.y_max_m, 0.0, -self.pixel_size_m)
 
-    def px_from_xy(self, xy_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def px_from_xy(self, xy_m: Floats) -> Floats:
         """Return pixel coordinates (x along columns, y along rows; centres are integers) of map points, shape (..., 2)."""
         corner = np.array([self.x_min_m, self.y_max_m])
-        px: NDArray[np.float64] = (np.asarray(xy_m) - corner) * np.array([1.0, -1.0]) / self.pixel_size_m - 0.5
+        px: Floats = (np.asarray(xy_m) - corner) * np.array([1.0, -1.0]) / self.pixel_size_m - 0.5
         return px
 
-    def xy_from_px(self, px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def xy_from_px(self, px: Floats) -> Floats:
         """Return map points [m] of pixel coordinates, shape (..., 2): the inverse of `px_from_xy`."""
         corner = np.array([self.x_min_m, self.y_max_m])
-        xy_m: NDArray[np.float64] = corner + (np.asarray(px) + 0.5) * np.array([1.0, -1.0]) * self.pixel_size_m
+        xy_m: Floats = corner + (np.asarray(px) + 0.5) * np.array([1.0, -1.0]) * self.pixel_size_m
         return xy_m
 
-    def contains(self, xy_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def contains(self, xy_m: Floats) -> Mask:
         """Return whether map points, shape (..., 2) [m], lie on the grid, its outer edges included; what is not finite does not."""
         x_min, y_min, x_max, y_max = self.bounds_m
         x, y = xy_m[..., 0], xy_m[..., 1]
-        inside: NDArray[np.bool_] = (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)
+        inside: Mask = (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)
         return inside

@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.terrain.layers import STACKS, ClassTable, Layer, Stack, find_no_data_value, group_stacks
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 from tcpipe.terrain.resampling import choose_factor
@@ -78,7 +79,7 @@ def find_map_projection(source: MapReader, gnss_crs: str) -> Projection:
     return Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, compute_area(crs, source.grid.bounds_m))
 
 
-def group_by_tile(px: NDArray[np.float64], source: MapReader) -> Iterator[NDArray[np.int64]]:
+def group_by_tile(px: Floats, source: MapReader) -> Iterator[Ints]:
     """Yield the indices of pixel positions, shape (N, 2), by tile; within a tile in Z-order.
 
     Tiles come row by row inside strips narrow enough that a tile is still held when the rows above and below want it.
@@ -127,12 +128,12 @@ class TilePool:
         flat = {str(stack): values.reshape(-1) for stack, values in self._flat.items()}
         return Tiles(**flat, slots=self.slots, rows=self._map.tile_px, cols=self._map.tile_px)
 
-    def expect(self, boxes: NDArray[np.int64]) -> None:
+    def expect(self, boxes: Ints) -> None:
         """Have the tiles at hand that any of the boxes touches, as `hold` has them: it is called for parts of them soon."""
         touched = _list_touched(boxes, self._map.tile_px, self.slots.shape)
         self._map.expect([tile for tile in touched if tile not in self._held])
 
-    def hold(self, boxes: NDArray[np.int64]) -> None:
+    def hold(self, boxes: Ints) -> None:
         """Make the tiles available that any of the boxes touches (first row and column, last row and column exclusive; (N, 4))."""
         wanted = _list_touched(boxes, self._map.tile_px, self.slots.shape)
         absent = [tile for tile in wanted if tile not in self._held]
@@ -169,7 +170,7 @@ class TilePool:
                 self._map.read_tile(layer, *tile, place.reshape(side, side))
 
 
-def _list_touched(boxes: NDArray[np.int64], side: int, shape: tuple[int, int]) -> list[tuple[int, int]]:
+def _list_touched(boxes: Ints, side: int, shape: tuple[int, int]) -> list[tuple[int, int]]:
     """Return the tiles of the map that boxes touch, row by row."""
     first, last = boxes[:, :2] // side, (boxes[:, 2:] - 1) // side
     rows, cols = (last - first + 1).max(axis=0, initial=0).tolist()

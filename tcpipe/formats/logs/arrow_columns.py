@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Bytes, Ints
 from tcpipe.formats.logs.log_part import MessageBlock, gather_integers, group_by_key
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError
 from tcpipe.logs.wire_types import (
@@ -52,7 +53,7 @@ _BEFORE_ALL = -(2**63)
 LOG_TIME = "log_time_ns"
 PUBLISH_TIME = "publish_time_ns"
 
-_Int64 = NDArray[np.int64]
+_Int64 = Ints
 
 
 def make_arrow_schema(message: Record) -> pa.Schema:
@@ -86,7 +87,7 @@ class TopicTable:
         """About how much memory the messages take that no table was taken of yet."""
         self._type, self._encoding = message_type, encoding
         self._wire = message_type.wire
-        self._gathered: list[tuple[_Int64, NDArray[np.uint8], _Int64]] = []
+        self._gathered: list[tuple[_Int64, Bytes, _Int64]] = []
         """Rows of messages, their payloads one after the other, and how long each is."""
         self._gathered_bytes = 0
         self._scratch = np.zeros(0, np.uint8)
@@ -185,9 +186,7 @@ class TopicTable:
             else:
                 self._decode_lengths(rows[part], data, starts[part], ends[part], dialect)
 
-    def _decode_lengths(
-        self, rows: _Int64, data: NDArray[np.uint8], starts: _Int64, ends: _Int64, dialect: Dialect
-    ) -> None:
+    def _decode_lengths(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64, dialect: Dialect) -> None:
         """Decode messages, those of each length that many have apart: a field of them is a strided view."""
         lengths = ends - starts
         if (lengths == lengths[0]).all():
@@ -205,7 +204,7 @@ class TopicTable:
             group = np.sort(np.concatenate(list(groups.values())))
             self._decode_dialect(rows[group], data, starts[group], ends[group], dialect)
 
-    def _split_dialects(self, data: NDArray[np.uint8], starts: _Int64, lengths: _Int64) -> Iterator[slice | _Int64]:
+    def _split_dialects(self, data: Bytes, starts: _Int64, lengths: _Int64) -> Iterator[slice | _Int64]:
         """Yield which messages have the same head of CDR; those that are too short for one have none."""
         if self._encoding != "cdr":
             yield slice(None)
@@ -219,9 +218,7 @@ class TopicTable:
         else:
             yield from (rows for _, rows in group_by_key(kinds))
 
-    def _decode_dialect(
-        self, rows: _Int64, data: NDArray[np.uint8], starts: _Int64, ends: _Int64, dialect: Dialect
-    ) -> None:
+    def _decode_dialect(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64, dialect: Dialect) -> None:
         """Decode messages side by side, and what that cannot do one by one."""
         walked = self._walked(data, starts, ends, dialect)
         if walked.root:
@@ -234,7 +231,7 @@ class TopicTable:
         elif left.any():
             self._leave_out("its lengths contradict its size", int(left.sum()))
 
-    def _walked(self, data: NDArray[np.uint8], starts: _Int64, ends: _Int64, dialect: Dialect) -> WalkResult:
+    def _walked(self, data: Bytes, starts: _Int64, ends: _Int64, dialect: Dialect) -> WalkResult:
         if self._side_by_side:
             try:
                 return walk(self._wire, data, starts, ends, dialect)
@@ -242,7 +239,7 @@ class TopicTable:
                 self._side_by_side = False
         return WalkResult(None, np.zeros(len(starts), np.bool_))
 
-    def _row_by_row(self, rows: _Int64, data: NDArray[np.uint8], starts: _Int64, ends: _Int64) -> None:
+    def _row_by_row(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64) -> None:
         """Decode message by message; one that does not fit its definition is counted and left out."""
         try:
             decode = self._decode_row = self._decode_row or self._type.row_decoder(self._encoding)
@@ -277,7 +274,7 @@ class TopicTable:
             self._parts.append((rows, pa.Table.from_arrays(columns, schema=self._fields)))
 
 
-def _gather_payloads(buffer: memoryview, offsets: _Int64, length: int) -> NDArray[np.uint8]:
+def _gather_payloads(buffer: memoryview, offsets: _Int64, length: int) -> Bytes:
     """Return messages of one length one after the other."""
     if not length:
         return np.zeros(0, np.uint8)
@@ -329,7 +326,7 @@ def make_lists(values: pa.Array, counts: _Int64, length: int | None) -> pa.Array
 class WalkedColumns:
     """Builds the columns of messages that `tcpipe.logs.wire_types` has walked; ``data`` is what it walked over."""
 
-    def __init__(self, data: NDArray[np.uint8]) -> None:
+    def __init__(self, data: Bytes) -> None:
         self.replaced_texts = 0
         self._data = data
 

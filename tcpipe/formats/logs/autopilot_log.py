@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import DTypeLike, NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import Ints, Mask
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import MAX_COLUMNS, MAX_TOPICS
 from tcpipe.formats.logs.log_part import gather_integers
@@ -153,15 +153,13 @@ class AutopilotRecords:
                 del self.messages[name]
 
 
-def _find_stray(time_us: Ints) -> NDArray[np.bool_]:
+def _find_stray(time_us: Ints) -> Mask:
     """Return which times, in the order of the file, are far from the median of those around them."""
     steps = np.diff(time_us)
     if len(time_us) < _WINDOW or not (steps < 0).any():
         return np.zeros(len(time_us), np.bool_)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(time_us, _WINDOW // 2, mode="edge"), _WINDOW)
-    is_stray: NDArray[np.bool_] = np.abs(time_us - np.median(around, axis=1)) > _STRAY_US + 10 * np.median(
-        np.abs(steps)
-    )
+    is_stray: Mask = np.abs(time_us - np.median(around, axis=1)) > _STRAY_US + 10 * np.median(np.abs(steps))
     return is_stray
 
 

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import Bytes, Ints, Mask
 from tcpipe.formats.logs.chunk_reading import ChunkedPart, Excerpt, Messages
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
@@ -150,7 +149,7 @@ def stamp_ns(fields: dict[bytes, bytes], name: bytes) -> int:
     return seconds * NS + nanoseconds  # type: ignore[no-any-return]
 
 
-def read_indexed_messages(found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
+def read_indexed_messages(found: Excerpt) -> tuple[Messages, Mask]:
     """Return the messages of an excerpt, and at which of its entries there is one of that connection and time that ends before the next.
 
     Headers of messages agree but for connection and time, so the first is parsed and the others compared to it.
@@ -164,7 +163,7 @@ def read_indexed_messages(found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
     fits = room >= length + 8
     if not fits[0] or length > MAX_HEADER_BYTES:
         return none, np.zeros(len(offset), np.bool_)
-    windows: NDArray[np.uint8] = np.ndarray((len(data) - length - 7, length + 8), np.uint8, data, 0, (1, 1))
+    windows: Bytes = np.ndarray((len(data) - length - 7, length + 8), np.uint8, data, 0, (1, 1))
     heads = windows[np.where(fits, offset, offset[0])]
     conn_at, time_at = _find_message_fields(heads[0, 4 : length + 4].tobytes())
     if not conn_at or not time_at:
@@ -175,7 +174,7 @@ def read_indexed_messages(found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
     times = heads[:, time_at : time_at + 8].copy().view("<u4").astype(np.int64)
     stamp_ns = times[:, 0] * NS + times[:, 1]
     payload_bytes = heads[:, length + 4 :].copy().view("<u4")[:, 0].astype(np.int64)
-    true: NDArray[np.bool_] = (
+    true: Mask = (
         fits
         & (channel == entries.channel)
         & (stamp_ns == entries.log_time_ns)
@@ -291,7 +290,7 @@ class BagPart(ChunkedPart[_Chunk]):
             return chunk
         return replace(chunk, record=record, size=size)
 
-    def read_indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
+    def read_indexed(self, found: Excerpt) -> tuple[Messages, Mask]:
         """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
         return read_indexed_messages(found)
 

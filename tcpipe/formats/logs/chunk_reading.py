@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import Ints, Mask
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_part import Bounds, ByteSource, DamageError, FetchedFile, MessageBlock
 from tcpipe.logs.topics import Damage, Topic
@@ -45,7 +44,7 @@ class Entries:
     end: Ints
     log_time_ns: Ints
 
-    def at(self, chosen: slice | Ints | NDArray[np.bool_]) -> Entries:
+    def at(self, chosen: slice | Ints | Mask) -> Entries:
         """Return some of them."""
         columns = (self.chunk, self.channel, self.offset, self.end, self.log_time_ns)
         return Entries(*(values[chosen] for values in columns))
@@ -71,7 +70,7 @@ class Excerpt:
     offset: Ints
     entries: Entries
 
-    def at(self, chosen: NDArray[np.bool_]) -> Excerpt:
+    def at(self, chosen: Mask) -> Excerpt:
         """Return it with some of the messages."""
         return Excerpt(self.data, self.offset[chosen], self.entries.at(chosen))
 
@@ -88,7 +87,7 @@ class Messages:
     log_time_ns: Ints
     publish_time_ns: Ints
 
-    def at(self, chosen: Ints | NDArray[np.bool_]) -> Messages:
+    def at(self, chosen: Ints | Mask) -> Messages:
         """Return some of them."""
         columns = (self.channel, self.offset, self.payload, self.length, self.log_time_ns, self.publish_time_ns)
         return Messages(self.data, *(values[chosen] for values in columns))
@@ -186,7 +185,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         """Return where in the file the records of a chunk begin, of which pieces can be read; None where it must be loaded."""
 
     @abstractmethod
-    def read_indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
+    def read_indexed(self, found: Excerpt) -> tuple[Messages, Mask]:
         """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
 
     @abstractmethod
@@ -215,7 +214,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
             for span in plan_chunk_spans(entries, sizes, sound, sorted(wanted)):
                 yield from self._read_span_blocks(span, members, wanted)
 
-    def entries(self, chunks: list[AnyChunk], sizes: Ints) -> tuple[Entries, NDArray[np.bool_]]:
+    def entries(self, chunks: list[AnyChunk], sizes: Ints) -> tuple[Entries, Mask]:
         """Return the messages of chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
         (chunk, channel, offset, log_time_ns), unsound = self.read_indexes(chunks)
         entries, sound = sort_by_place(chunk, channel, offset, log_time_ns, sizes, least_bytes=self.least_bytes)
@@ -317,7 +316,7 @@ def sort_by_place(
     sizes: Ints,
     *,
     least_bytes: int,
-) -> tuple[Entries, NDArray[np.bool_]]:
+) -> tuple[Entries, Mask]:
     """Return index entries (shape (N,) each) in their order in chunks of ``sizes`` bytes, and which chunks' are sound.
 
     Of those that are not, a message would begin outside the chunk, or have less than ``least_bytes`` before the next.
@@ -335,7 +334,7 @@ def sort_by_place(
     return (entries if sound.all() else entries.at(sound[chunk])), sound
 
 
-def plan_chunk_spans(entries: Entries, sizes: Ints, sound: NDArray[np.bool_], wanted: Sequence[int]) -> Iterator[Span]:
+def plan_chunk_spans(entries: Entries, sizes: Ints, sound: Mask, wanted: Sequence[int]) -> Iterator[Span]:
     """Yield, in order, how to read the chunks of a group: those of which little is wanted together, others one by one.
 
     ``entries`` are the messages of those whose index is sound; ``sizes`` [byte] and ``sound`` are of all chunks, shape (M,).

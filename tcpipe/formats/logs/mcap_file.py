@@ -13,9 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 from isal.isal_zlib import crc32
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import Ints, Mask
 from tcpipe.formats.logs.chunk_reading import (
     MAX_PLANNED_BYTES,
     ChunkedPart,
@@ -126,7 +125,7 @@ class McapPart(ChunkedPart[Chunk]):
             self._bytes.skips()
         return found
 
-    def read_indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
+    def read_indexed(self, found: Excerpt) -> tuple[Messages, Mask]:
         """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
         messages, right = read_messages_at(found.data, found.offset)
         entries = found.entries

@@ -11,7 +11,7 @@ import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import Ints, Mask
 from tcpipe.formats.logs.chunk_reading import Messages
 from tcpipe.formats.logs.log_part import ByteSource, DamageError, gather_integers, outline_of
 
@@ -202,9 +202,7 @@ def index_entries(record: bytes | memoryview, channel: int) -> Ints:
     return np.frombuffer(record, "<i8", size // 8, RECORD_HEAD + 6).reshape(-1, 2)
 
 
-def index_messages(
-    data: bytes, records: Ints, ends: Ints, channels: Ints
-) -> tuple[NDArray[np.bool_], Ints, Ints, Ints]:
+def index_messages(data: bytes, records: Ints, ends: Ints, channels: Ints) -> tuple[Mask, Ints, Ints, Ints]:
     """Read several message indexes at once.
 
     ``records``, ``ends`` and ``channels`` say of each index, shape (R,), where it begins in ``data``, before which byte it must end, and
@@ -234,7 +232,7 @@ def index_messages(
     return right, record, gather_integers(data, places, "i8"), gather_integers(data, places + 8, "i8")
 
 
-def read_messages_at(data: memoryview, offsets: Ints) -> tuple[Messages, NDArray[np.bool_]]:
+def read_messages_at(data: memoryview, offsets: Ints) -> tuple[Messages, Mask]:
     """Return the messages whose records begin at ``offsets``, within the data, and which of them are messages by opcode and length."""
     count = max(len(data) - _MESSAGE.itemsize + 1, 0)
     windows: NDArray[np.void] = np.ndarray((count,), f"V{_MESSAGE.itemsize}", data if count else b"", 0, (1,))

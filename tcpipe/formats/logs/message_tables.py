@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import OpenLog, hash_files
 from tcpipe.logs.topics import Damage, Topic, find_damage
@@ -70,7 +71,7 @@ class TableLog(OpenLog):
             yield {name: self._made[name]()}
 
 
-def make_stamp_fields(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+def make_stamp_fields(stamp_ns: Ints) -> dict[str, Ints]:
     """Return the fields of a header's stamp."""
     second, rest = np.divmod(stamp_ns, 1_000_000_000)
     return {"header.stamp.sec": second, "header.stamp.nanosec": rest}
@@ -79,7 +80,7 @@ def make_stamp_fields(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64
 def make_topic(
     name: str,
     type_name: str,
-    stamp_ns: NDArray[np.int64],
+    stamp_ns: Ints,
     read_fields: Callable[[], Fields],
     damage: Sequence[Damage] = (),
 ) -> TopicMessages:

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.message_tables import Fields, TableLog, TopicMessages, make_stamp_fields, make_topic
 from tcpipe.formats.logs.table_folders import TABLE_SUFFIXES, Mappings, is_table, list_table_files
@@ -110,7 +110,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
 def _read_messages(
     read_as: tuple[str, str, str],
     file: str,
-    values: Mapping[str, NDArray[np.float64]],
+    values: Mapping[str, Floats],
     stamps: Clock,
     damage: Sequence[Damage],
 ) -> TopicMessages:
@@ -175,7 +175,7 @@ class Cells:
     """
 
     stamps: dict[str, pl.Series]
-    columns: dict[str, NDArray[np.float64]]
+    columns: dict[str, Floats]
     texts: dict[str, tuple[int, int, str]]
 
 
@@ -217,7 +217,7 @@ def read_cells(path: Path, *, stamps: Sequence[str], columns: Sequence[str], wor
     return Cells({name: frame[name] for name in stamps}, read, texts)
 
 
-def read_numbers(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def read_numbers(path: Path, names: Sequence[str]) -> dict[str, Floats]:
     """Return the first rows of columns that contain numbers, shape (rows,), NaN where a cell has none; `LogError`: it is no table."""
     with _report_unreadable(path):
         frame = _collect_columns(path, [*names], numbers=[*names], rows=_SAMPLE_ROWS)
@@ -227,7 +227,7 @@ def read_numbers(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float
 
 def read_column_values(
     path: Path, stamps: Sequence[str], fields: Mapping[str, FieldSource]
-) -> tuple[Cells, dict[str, NDArray[np.float64]]]:
+) -> tuple[Cells, dict[str, Floats]]:
     """Return the cells that fields are made of, and the fields' values, shape (rows,)."""
     used = {name: [column for column, _ in field.expression.operands()] for name, field in fields.items()}
     numbers = [column for name, columns in used.items() if name != "quality" for column in columns]

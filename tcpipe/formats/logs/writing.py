@@ -24,6 +24,7 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from tcpipe.arrays import Bytes, Ints
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import write_atomic_directory, write_atomic_file
 from tcpipe.formats.logs.ros_types import load_shipped_definitions
@@ -47,10 +48,10 @@ class MessageStream:
 
     topic: str
     type_name: str
-    log_time_ns: NDArray[np.int64]
+    log_time_ns: Ints
     columns: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     constants: Mapping[str, Any] = field(default_factory=dict)
-    publish_time_ns: NDArray[np.int64] | None = None
+    publish_time_ns: Ints | None = None
     latched: bool = False
     definition: str = ""
     """Text of a type that neither rosbags nor `load_shipped_definitions` knows."""
@@ -123,7 +124,7 @@ def _sort_messages(streams: Sequence[MessageStream], encoding: Encoding) -> list
     return [(i, r, payloads[i][r].tobytes(), t, p) for i, r, t, p in zip(*listed, strict=True)]
 
 
-def _serialize_messages(stream: MessageStream, encoding: Encoding) -> NDArray[np.uint8]:
+def _serialize_messages(stream: MessageStream, encoding: Encoding) -> Bytes:
     """Return the serialised messages, one a row."""
     store = _store_of(stream, encoding)
     encode: Callable[[object, str], Any] = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
@@ -135,7 +136,7 @@ def _serialize_messages(stream: MessageStream, encoding: Encoding) -> NDArray[np
     first = {name: _to_rosbags_value(values[0]) for name, values in columns.items()}
     message = _make_message(store, stream.type_name, _nest_fields({**stream.constants, **first}))
 
-    def serialize() -> NDArray[np.uint8]:
+    def serialize() -> Bytes:
         return np.frombuffer(bytes(encode(message, stream.type_name)), np.uint8)
 
     rows = np.tile(serialize(), (count, 1))
@@ -155,7 +156,7 @@ def _check_lengths(topic: str, columns: Mapping[str, NDArray[Any]]) -> None:
             raise UsageError(f"{topic}: column {name} ({values.dtype}) wants numbers, or bytes of one length")
 
 
-def _place(message: Any, name: str, dtype: np.dtype[Any], serialize: Callable[[], NDArray[np.uint8]]) -> int:
+def _place(message: Any, name: str, dtype: np.dtype[Any], serialize: Callable[[], Bytes]) -> int:
     """Return where a field begins in the serialised message: it is written twice, with different bytes."""
     *parents, leaf = name.split(".")
     owner = functools.reduce(getattr, parents, message)

@@ -34,6 +34,7 @@ from rasterio.features import rasterize
 from rasterio.io import MemoryFile
 from rasterio.windows import Window
 
+from tcpipe.arrays import Bytes, Floats, Mask
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.maps.map_facts import read_value_names
@@ -136,7 +137,7 @@ class Tile:
     """Scale and offset to metres, to grey from 0 to 255, or to the numbers that are meant."""
     unit: str
     """Unit of numbers by the file; empty if the file states no unit."""
-    opaque: NDArray[np.bool_] | None
+    opaque: Mask | None
     """Which indices of a palette can be seen."""
 
 
@@ -157,7 +158,7 @@ def keep_open() -> Iterator[OpenFile]:
 
 def read_window(  # noqa: PLR0917
     open_file: OpenFile, tile: Tile, row0: int, row1: int, col0: int, col1: int
-) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+) -> tuple[NDArray[Any], Mask]:
     """Return a window inside a tile, and which of its pixels have data; `MapError`: they are damaged, or the file is gone.
 
     Values are float64 metres or numbers, float64 grey or colour from 0 to 255, or raw integers of classes.
@@ -183,7 +184,7 @@ def read_window(  # noqa: PLR0917
     return values, valid & np.isfinite(values)
 
 
-def _read_whole_numbers(tile: Tile, values: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
+def _read_whole_numbers(tile: Tile, values: NDArray[Any], valid: Mask) -> NDArray[Any]:
     """Return class values that are stored as floats; `MapError` for one that is no whole number."""
     whole = np.where(valid, values, 0.0)
     odd = whole[(whole != np.rint(whole)) | (np.abs(whole) > np.iinfo(tile.dtype).max)]
@@ -195,9 +196,7 @@ def _read_whole_numbers(tile: Tile, values: NDArray[Any], valid: NDArray[np.bool
     return whole.astype(tile.dtype)
 
 
-def _read_grey(
-    dataset: Any, tile: Tile, raw: NDArray[Any], weights_rgb: tuple[float, float, float]
-) -> NDArray[np.float64]:
+def _read_grey(dataset: Any, tile: Tile, raw: NDArray[Any], weights_rgb: tuple[float, float, float]) -> Floats:
     if dataset.colorinterp[tile.bands[0] - 1] == ColorInterp.palette:
         return np.asarray(_read_palette_grey(dataset.colormap(tile.bands[0]), weights_rgb)[raw[0]])
     weights = np.array(weights_rgb if len(tile.bands) == 3 else (1.0,)) * tile.scale[0]
@@ -453,7 +452,7 @@ def _describe_as_vrt(dataset: Any) -> str:
         return str(memory.read().decode("utf-8", "replace"))
 
 
-def burn_polygons(polygons: NDArray[np.object_], ids: NDArray[np.uint8], grid: MapGrid) -> NDArray[np.uint8]:
+def burn_polygons(polygons: NDArray[np.object_], ids: Bytes, grid: MapGrid) -> Bytes:
     """Return the id of the last polygon that contains each pixel's centre, shape (rows, cols); 0 without a polygon."""
     shape = grid.rows, grid.cols
     if not len(polygons):
@@ -464,7 +463,7 @@ def burn_polygons(polygons: NDArray[np.object_], ids: NDArray[np.uint8], grid: M
 
 def _read_palette_grey(
     colormap: dict[int, tuple[int, int, int, int]], weights_rgb: tuple[float, float, float] = LUMA_RGB
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return grey by palette index; NaN where the palette is transparent or has no entry."""
     grey = np.full(65536, np.nan)
     for index, (red, green, blue, alpha) in colormap.items():

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
 
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.errors import MapError
 from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.maps.geotiff import (
@@ -51,7 +52,7 @@ class Raster:
     """One a code, of the first tile that has it."""
     names: Mapping[int, str]
     tiles: tuple[Tile, ...]
-    _corners: NDArray[np.int64] = field(repr=False)
+    _corners: Ints = field(repr=False)
     """First row, last row (not included), first column, last column of each tile, shape (T, 4)."""
     open_file: OpenFile = field(repr=False)
 
@@ -60,7 +61,7 @@ class Raster:
         """Its name without the folder."""
         return label_files([Path(tile.path.name) for tile in self.tiles])
 
-    def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], Mask]:
         """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.read_window` does of one tile."""
         low = np.maximum(self._corners[:, ::2], (row0, col0))
         high = np.minimum(self._corners[:, 1::2], (row1, col1))
@@ -146,7 +147,7 @@ def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: s
         )
 
 
-def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, float, float, float], NDArray[np.int64]]:
+def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, float, float, float], Ints]:
     """Return the affine of all tiles together, and the place of each in it: first row, last row, first column, last column."""
     pixels = [tuple(f"{tile.affine[n]:.6g}" for n in (0, 1, 3, 4)) for tile in tiles]
     base = pixels.index(Counter(pixels).most_common(1)[0][0])
@@ -171,7 +172,7 @@ def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, fl
     return (a, b, x + a * col + b * row, d, e, y + d * col + e * row), corners
 
 
-def _find_grid_positions(tiles: Sequence[Tile], base: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _find_grid_positions(tiles: Sequence[Tile], base: int) -> tuple[Floats, Mask]:
     """Return the column and row of every tile's first pixel on the grid of one of them, shape (T, 2), and which do not lie on it."""
     affines = np.array([tile.affine for tile in tiles], np.float64).reshape(-1, 2, 3)
     sizes = np.array([(tile.cols, tile.rows) for tile in tiles])
@@ -215,10 +216,10 @@ class Plateau:
     """Pixels of exactly the smallest value of a raster; ``counts`` are these, steps to their neighbours, and the large steps."""
 
     value: float = math.inf
-    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(3, np.int64))
+    counts: Ints = field(default_factory=lambda: np.zeros(3, np.int64))
     total: int = 0
 
-    def count(self, values: NDArray[np.float64], valid: NDArray[np.bool_], *, min_step: float) -> None:
+    def count(self, values: Floats, valid: Mask, *, min_step: float) -> None:
         """Count a window that has data."""
         lowest = float(values[valid].min())
         inside, self.total = valid & (values == lowest), self.total + int(valid.sum())
@@ -244,7 +245,7 @@ class Tally:
     pixels: int = 0
     low: float = math.inf
     high: float = -math.inf
-    by_class: NDArray[np.int64] = field(default_factory=lambda: np.zeros(256, np.int64))
+    by_class: Ints = field(default_factory=lambda: np.zeros(256, np.int64))
     unnamed: set[int] = field(default_factory=set)
     unnamed_pixels: int = 0
     nodata: float = math.nan
@@ -367,7 +368,7 @@ class RasterLayer:
             if (share := (high - low + 1) / 255.0) < read_threshold(_NARROW, "min_range_fraction"):
                 yield make_finding(_NARROW, subject, names=names, range_fraction=share)
 
-    def _compute_lattice(self, row0: int, col0: int, rows: int, cols: int) -> NDArray[np.float64]:
+    def _compute_lattice(self, row0: int, col0: int, rows: int, cols: int) -> Floats:
         return compute_source_lattice(self.grid, self.raster.georeference, self.projection, row0, rows, col0, cols)
 
     def _fill(self, part: Pixels, row0: int, col0: int) -> None:
@@ -407,7 +408,7 @@ class RasterLayer:
             resample_bilinear(source, lattice, part)
 
 
-def _compute_source_px_per_px(lattice: NDArray[np.float64]) -> float:
+def _compute_source_px_per_px(lattice: Floats) -> float:
     """Return how many source pixels a map pixel spans, the longer way; NaN where the raster's CRS is not defined."""
     across = np.linalg.norm(lattice[0, 1] - lattice[0, 0])
     down = np.linalg.norm(lattice[1, 0] - lattice[0, 0])

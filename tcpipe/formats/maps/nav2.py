@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Bytes, Floats
 from tcpipe.errors import PathError
 from tcpipe.formats.atomic import write_atomic_file, write_text
 from tcpipe.formats.geojson import shorten_problems, shorten_value
@@ -34,7 +34,7 @@ _OCCUPIED = 0.995
 """Between the darkest grey of `HIGHEST` and black."""
 
 
-def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, frame: str, meaning: str) -> None:
+def write_nav2_map(path: Path, cost: Bytes, grid: MapGrid, *, frame: str, meaning: str) -> None:
     """Write ``path`` (.yaml) and the picture of the same name beside it.
 
     ``cost`` is from 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first; ``grid`` places the cells in the frame; ``frame`` and
@@ -44,12 +44,12 @@ def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, frame:
     _write_grey(path, grey, grid, mode="scale", comments=(meaning, f"frame: {frame}"))
 
 
-def write_nav2_mask(path: Path, values: NDArray[np.uint8], grid: MapGrid, *, frame: str, meaning: str) -> None:
+def write_nav2_mask(path: Path, values: Bytes, grid: MapGrid, *, frame: str, meaning: str) -> None:
     """Write the mask of a costmap filter as `write_nav2_map`, in mode ``raw``: a pixel is the mask's value, 0 to 100."""
     _write_grey(path, values, grid, mode="raw", comments=(meaning, f"frame: {frame}"))
 
 
-def _write_grey(path: Path, grey: NDArray[np.uint8], grid: MapGrid, *, mode: str, comments: Sequence[str]) -> None:
+def _write_grey(path: Path, grey: Bytes, grid: MapGrid, *, mode: str, comments: Sequence[str]) -> None:
     picture = path.with_suffix(".pgm")
     with write_atomic_file(picture) as temporary:
         temporary.write_bytes(f"P5\n{grid.cols} {grid.rows}\n255\n".encode() + grey.tobytes())
@@ -110,7 +110,7 @@ _POSE_M = 0.25
 """Largest distance of neighbouring poses of a path message [m]: controllers expect dense paths."""
 
 
-def make_path_message(xy_m: NDArray[np.float64]) -> Json:
+def make_path_message(xy_m: Floats) -> Json:
     """Return a ``nav_msgs/Path`` along points in the frame ``map`` [m], shape (P, 2), with the course of travel as yaw."""
     away_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))]
     between_m = np.linspace(0.0, away_m[-1], int(np.ceil(away_m[-1] / _POSE_M)) + 1)
@@ -124,7 +124,7 @@ def make_path_message(xy_m: NDArray[np.float64]) -> Json:
     return {"header": header, "poses": poses}
 
 
-def make_gps_waypoints(lonlat_deg: NDArray[np.float64], enu_m: NDArray[np.float64]) -> Json:
+def make_gps_waypoints(lonlat_deg: Floats, enu_m: Floats) -> Json:
     """Return the goal of ``nav2_msgs/action/FollowGPSWaypoints``: the points of a path after its start, shape (P, 2).
 
     ``enu_m`` are the same points in a true east-north frame [m]; a waypoint has the yaw with which the path arrives there.
@@ -136,7 +136,7 @@ def make_gps_waypoints(lonlat_deg: NDArray[np.float64], enu_m: NDArray[np.float6
     return {"number_of_loops": 0, "goal_index": 0, "gps_poses": poses}
 
 
-def _make_orientations(xy_m: NDArray[np.float64]) -> list[Json]:
+def _make_orientations(xy_m: Floats) -> list[Json]:
     """Return the course from each point to the next as quaternions; the last point has that of the one before."""
     east, north = np.diff(xy_m, axis=0).T
     half = np.arctan2(north, east) / 2.0

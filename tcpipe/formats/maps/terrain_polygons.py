@@ -17,6 +17,7 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
 
+from tcpipe.arrays import Bytes
 from tcpipe.errors import MapError, RegionError
 from tcpipe.formats.geojson import PolygonFeature, read_polygons, shorten_problems, shorten_value
 from tcpipe.formats.maps.geotiff import burn_polygons
@@ -57,7 +58,7 @@ class PolygonLayer:
     name: str
     grid: MapGrid
     polygons: NDArray[np.object_]
-    ids: NDArray[np.uint8]
+    ids: Bytes
     findings: tuple[Finding, ...]
     values: Sequence[int]
     """Numbers that stand for classes in the file, in place of names."""
@@ -194,7 +195,7 @@ def _project_polygons(
     )
 
 
-def _find_overlaps(polygons: NDArray[np.object_], ids: NDArray[np.uint8], scheme: ClassScheme) -> tuple[Finding, ...]:
+def _find_overlaps(polygons: NDArray[np.object_], ids: Bytes, scheme: ClassScheme) -> tuple[Finding, ...]:
     """Return how much ground polygons of different classes share; of very many, and of very detailed ones, not all are looked at."""
     tree, shared_m2, worst_m2, left = shapely.STRtree(polygons), 0.0, 0.0, _LOOKED_AT
     names: dict[str, str] = {}

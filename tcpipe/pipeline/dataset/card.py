@@ -8,9 +8,9 @@ from dataclasses import asdict, replace
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from tcpipe import __version__
+from tcpipe.arrays import Floats
 from tcpipe.cost.labels import pool_budgets
 from tcpipe.cost.physics import fit_and_validate_physics
 from tcpipe.cost.repeatability import compute_slope_residuals, estimate_repeatability, find_repeated_pairs
@@ -55,7 +55,7 @@ CARD_COLUMNS = ("run_id", "robot", "split", "fold", "terrain_name", "quality", *
 
 
 def measure_repeatability(
-    samples: pa.Table, xy_m: NDArray[np.float64], *, velocity_column: str, chord_m: float
+    samples: pa.Table, xy_m: Floats, *, velocity_column: str, chord_m: float
 ) -> dict[str, Floor | None]:
     """Return how well each label repeats itself; ``samples`` has `REPEATABILITY_COLUMNS`, ``xy_m`` are their centres [m], shape (N, 2)."""
     slope_rad = np.nan_to_num(to_floats(samples, "slope_rad"))  # unknown without patches

@@ -18,6 +18,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pyproj import CRS
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import (
     LOCAL,
@@ -78,12 +79,12 @@ class SampleTable:
 
     segments: pa.Table
     sampled: Sampled
-    slot: NDArray[np.int64]
+    slot: Ints
     has_terrain: bool
     assigned: Assignment
     map_names: tuple[str, ...]
     class_names: NDArray[np.str_]
-    patch: NDArray[np.int64]
+    patch: Ints
     flags: NDArray[np.uint32]
     """Quality bits of each patch of ``sampled`` beyond those of its segment."""
     added: pa.Table
@@ -104,22 +105,22 @@ class SampleTable:
         corners = [corner for piece in pieces for corner in (piece.min(axis=0), piece.max(axis=0))]
         return add_geo_metadata(bare, "Point", np.array(corners).reshape(-1, 2)).schema
 
-    def _centres_deg(self, patches: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _centres_deg(self, patches: Ints) -> Floats:
         """Return the centre of patches of ``sampled``, WGS 84 lon, lat [deg], shape (N, 2)."""
         corners = np.unwrap(self.sampled.footprint_lonlat_deg[patches], axis=1, period=360.0)  # on the date line
-        centres: NDArray[np.float64] = corners.mean(axis=1)
+        centres: Floats = corners.mean(axis=1)
         return centres
 
     def __len__(self) -> int:
         """Return the number of samples."""
         return len(self.patch)
 
-    def take(self, rows: NDArray[np.int64]) -> pa.Table:
+    def take(self, rows: Ints) -> pa.Table:
         """Return rows of the samples table as the dataset has them."""
         table = self._make_rows(rows)
         return table if self.convert is None else self.convert(table)
 
-    def _make_rows(self, rows: NDArray[np.int64]) -> pa.Table:
+    def _make_rows(self, rows: Ints) -> pa.Table:
         """Return rows of the samples table with coordinates (schema SAMPLES, and the added columns behind it)."""
         at = self.patch[rows]
         assigned = self.assigned.select(at)
@@ -156,7 +157,7 @@ class SampleTable:
         for first in range(0, max(len(self), 1), ROWS_PER_GROUP):
             yield self.take(np.arange(first, min(first + ROWS_PER_GROUP, len(self))))
 
-    def centres_xy_m(self) -> NDArray[np.float64]:
+    def centres_xy_m(self) -> Floats:
         """Return the centre of every footprint in the first map's plane [m], shape (N, 2)."""
         centres = np.empty((len(self), 2))
         for first in range(0, len(self), ROWS_PER_GROUP):
@@ -364,7 +365,7 @@ _NUMBER = re.compile(r"[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d{1,3})?")
 
 def make_added_columns(
     segments: pa.Table,
-    kept: NDArray[np.int64],
+    kept: Ints,
     runs: Sequence[RunSource],
     tables: Sequence[CovariateTable],
     config: CovariateConfig,

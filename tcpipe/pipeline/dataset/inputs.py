@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Mask
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.errors import DatasetError, MapError, StoreError, list_first
 from tcpipe.formats.dataset_card import (
     DatasetCard,
@@ -60,7 +59,7 @@ class ChosenInputs:
     made_from: DatasetInputs
     digest: str
     """Digest of ``made_from``."""
-    again: Mapping[str, NDArray[np.bool_]]
+    again: Mapping[str, Mask]
     """By run: segments that another run has too."""
     chosen: SelectedRuns
     findings: tuple[Finding, ...]
@@ -276,9 +275,9 @@ class UniqueRuns:
 class _SegmentPositions:
     """When and where a run's segments lie, in the order of its file, which is that of time: [ns], (N,), and lon, lat [deg], (N, 2)."""
 
-    start_ns: NDArray[np.int64]
-    end_ns: NDArray[np.int64]
-    lonlat_deg: NDArray[np.float64]
+    start_ns: Ints
+    end_ns: Ints
+    lonlat_deg: Floats
 
 
 def remove_duplicates(runs: Sequence[StoredRun]) -> UniqueRuns:
@@ -416,7 +415,7 @@ def _find_shared(mine: _SegmentPositions, other: _SegmentPositions) -> Mask:
 
 def _find_overlapping(
     mine: _SegmentPositions, other: _SegmentPositions, *, slack_ns: int = 0, skew_ns: int = 0
-) -> tuple[Mask, NDArray[np.int64]]:
+) -> tuple[Mask, Ints]:
     """Mark the segments whose middle half overlaps one of the other's in time, but for the slack, and that lie within 2 m of it.
 
     The second array says how much later than that one they are [ns], once ``skew_ns`` is taken off.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.errors import MapError
 from tcpipe.formats.dataset_card import MapRegistration
 from tcpipe.formats.json_files import convert_record
@@ -103,7 +104,7 @@ def _register(run: StoredRun, source: MapFile, projection: Projection, config: S
     table = run.table("track", _COLUMNS)
     lon, lat, height_m, x_std_m, y_std_m, z_std_m = (to_floats(table, name) for name in _COLUMNS)
     std_m = np.hypot(x_std_m, y_std_m)
-    certain: NDArray[np.bool_] = std_m <= config.max_position_std_m
+    certain: Mask = std_m <= config.max_position_std_m
     lonlat = np.stack([lon, lat], axis=1)[certain]
     map_error_m = read_threshold("map-heights-differ", "map_error_m")
     expected_m = float(np.hypot(np.sqrt(np.mean(z_std_m[certain] ** 2)), map_error_m)) if certain.any() else map_error_m
@@ -190,7 +191,7 @@ _ATTITUDE_ROLES = {"imu", "visual_odometry", "pose"}
 _MIN_HEIGHT_CHANGE_M = 0.001
 """A track whose heights change by less has no measured heights."""
 _MOTION = ("start_z_m", "end_z_m", "chord_m", "pitch_rad", "roll_rad", "fused_velocity_mps")
-_Rows = NDArray[np.float64]
+_Rows = Floats
 
 
 def find_contradictions(
@@ -238,7 +239,7 @@ def _compare_ground(motion: _Rows, ground: _Rows, *, has_attitude: bool) -> _Row
     return excess
 
 
-def _find_clusters(rows: NDArray[np.int64], excess: _Rows, sampled: Sampled, maps: Sequence[str]) -> Iterator[Finding]:
+def _find_clusters(rows: Ints, excess: _Rows, sampled: Sampled, maps: Sequence[str]) -> Iterator[Finding]:
     """Yield findings on the largest clusters of patches ``rows``: place, size, and largest differences of slope and height."""
     places = KDTree(np.column_stack([sampled.footprint_xy_m[rows].mean(axis=1), 1e9 * sampled.map_index[rows]]))
     near = places.sparse_distance_matrix(places, read_threshold(_CONTRADICTION, "max_gap_m"))

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Mask
 from tcpipe.errors import DatasetError, list_first
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.documents import State
@@ -238,9 +238,9 @@ class Need:
     lack: str
     loss: Loss
 
-    def find_rows(self, segments: pa.Table) -> NDArray[np.bool_]:
+    def find_rows(self, segments: pa.Table) -> Mask:
         """Return the segments that have them, shape (M,)."""
-        known: NDArray[np.bool_] = np.all(np.isfinite([to_floats(segments, name) for name in self.columns]), axis=0)
+        known: Mask = np.all(np.isfinite([to_floats(segments, name) for name in self.columns]), axis=0)
         return known
 
     def is_met_by(self, run: StoredRun) -> bool:
@@ -265,7 +265,7 @@ def list_needs(runs: Sequence[StoredRun], labels: Sequence[str], *, has_patches:
 
 
 def pool_segments(
-    runs: Sequence[StoredRun], directory: Path, needs: Sequence[Need], *, again: Mapping[str, NDArray[np.bool_]]
+    runs: Sequence[StoredRun], directory: Path, needs: Sequence[Need], *, again: Mapping[str, Mask]
 ) -> tuple[pa.Table, dict[str, float], list[Finding]]:
     """Return the segments that can become samples, mapped from a file in ``directory``, and metres by reason, which sum to the odometers.
 
@@ -314,7 +314,7 @@ def _describe_nothing_usable(
 def _iterate_usable(
     runs: Sequence[StoredRun],
     needs: Sequence[Need],
-    again: Mapping[str, NDArray[np.bool_]],
+    again: Mapping[str, Mask],
     lacks: dict[str, list[str]],
     lost: Mapping[Loss, list[float]],
 ) -> Iterator[pa.Table]:

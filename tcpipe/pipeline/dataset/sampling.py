@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.errors import TcpipeError
 from tcpipe.execution import run_all, unwrap_result
 from tcpipe.formats.dataset_files import LayerPixels
@@ -73,7 +74,7 @@ class Spool:
         (self.directory / f"{batch}").write_bytes(b"".join(waiting))
         return replace(sampled, patches=replace(sampled.patches, pixels={}))
 
-    def read(self, layer: str, slots: NDArray[np.int64]) -> LayerPixels:
+    def read(self, layer: str, slots: Ints) -> LayerPixels:
         """Return the patches in ``slots``, shape (n, *patch); one span is read of each batch."""
         kind, each = self.layers[layer], self._patch_bytes(layer)
         dtype, shape = kind.stored, (self.patch_px, self.patch_px)
@@ -126,7 +127,7 @@ def sample_all_segments(
     shifts: Sequence[Shifts],
     jobs: int,
     directory: Path,
-) -> tuple[Sampled, NDArray[np.int64], Spool]:
+) -> tuple[Sampled, Ints, Spool]:
     """Sample each of M segments from the first map with data for it; return the results, slots in the order of ``kept``, and the spool.
 
     ``ranks`` give the dataset's order, uniform over 64 bits, shape (M,); ``gnss_crs`` is the CRS of the segments' positions,
@@ -173,7 +174,7 @@ def sample_all_segments(
     return sampled, move_rows_to_file(slots, kept, directory), replace(spool, counts=tuple(counts))
 
 
-def _iterate_batches(segments: pa.Table, size: int) -> Iterator[NDArray[np.int64]]:
+def _iterate_batches(segments: pa.Table, size: int) -> Iterator[Ints]:
     """Yield the rows of each batch, rising."""
     places = [np.floor((to_floats(segments, f"start_{axis}_deg") + 360.0) / _CELL_DEG) for axis in ("lon", "lat")]
     order = np.argsort(compute_morton(*(place.astype(np.int64) for place in places)), kind="stable")

@@ -10,6 +10,7 @@ import pyarrow as pa
 import shapely
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import SplitResult
 from tcpipe.formats.geojson import regions_to_json
@@ -101,13 +102,13 @@ def _number_values(run: NDArray[np.int32], values: list[str]) -> tuple[NDArray[n
     return np.array([names.index(value) for value in values], np.int32)[run], names
 
 
-def _project_regions(regions: Regions, projection: Projection, footprint_lonlat_deg: NDArray[np.float64]) -> Regions:
+def _project_regions(regions: Regions, projection: Projection, footprint_lonlat_deg: Floats) -> Regions:
     west, south = (footprint_lonlat_deg.min(axis=(0, 1)) - _MARGIN_DEG).tolist()
     east, north = (footprint_lonlat_deg.max(axis=(0, 1)) + _MARGIN_DEG).tolist()
     return project_regions(regions, projection.forward, window_deg=(west, south, east, north))
 
 
-def _describe_nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], assigned: Assignment) -> str:
+def _describe_nothing_inside(regions: Regions, lonlat_deg: Floats, assigned: Assignment) -> str:
     """Return why no sample is inside the region, and what to change."""
     points = shapely.multipoints(lonlat_deg.mean(axis=1))
     lon, lat = lonlat_deg.mean(axis=(0, 1))
