@@ -9,6 +9,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tcpipe.errors import Location
 from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import PlanPathOptions, PredictPathOptions
 from tcpipe.tables.options import as_function
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from tcpipe.planning.path_files import PathResult, PlanResult
 
 
-def read_log(path: str | Path, *, msgdef: str | Path | None = None) -> Log | TableLog:
+def read_log(path: Location, *, msgdef: Location | None = None) -> Log | TableLog:
     """Open a log: ``topics``, ``table(topic)``, ``tables(topics)``, ``damage``; a damaged log gives what is intact.
 
     Raises `LogError`: the path is no log. ``msgdef`` is a directory of definitions of types that the log does not define.

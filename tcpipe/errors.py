@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
+
+Location: TypeAlias = str | Path
+"""A path of this machine, or the URL of an object or a prefix."""
 
 _URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]+:/{1,2})(\S+)", re.IGNORECASE)
 _CLOSING = ")]}'\",;:."

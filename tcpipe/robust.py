@@ -6,8 +6,7 @@ scipy.optimize has the latter too, and is what the tests compare with; each proc
 from __future__ import annotations
 
 import numpy as np
-
-from tcpipe.arrays import Floats, Mask
+from numpy.typing import NDArray
 
 NORMAL_MEDIAN = 0.6744897501960817
 """Median of the absolute value of a normal variate of unit variance."""
@@ -17,12 +16,12 @@ MEDIAN_OF_SQUARES = NORMAL_MEDIAN**2
 """Median of its square."""
 
 
-def estimate_robust_std(residuals: Floats) -> float:
+def estimate_robust_std(residuals: NDArray[np.float64]) -> float:
     """Return the standard deviation of residuals about zero: that of the normal variate whose median absolute value is theirs."""
     return float(np.median(np.abs(residuals))) / NORMAL_MEDIAN
 
 
-def estimate_shorth(values: Floats) -> tuple[float, float]:
+def estimate_shorth(values: NDArray[np.float64]) -> tuple[float, float]:
     """Return centre and σ of the finite values by the shortest half of them, for few as Rousseeuw and Leroy (1987); of none 0, 0."""
     rising = np.sort(values[np.isfinite(values)])
     if not rising.size:
@@ -32,7 +31,7 @@ def estimate_shorth(values: Floats) -> tuple[float, float]:
     return float(rising[first] + widths[first] / 2.0), float(factor * widths[first] / 2.0)
 
 
-def solve_non_negative(columns: Floats, target: Floats) -> Floats:
+def solve_non_negative(columns: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the factors, none negative, shape (J,), by which the columns (S, J) add up nearest to the target (S,).
 
     Lawson and Hanson, Solving Least Squares Problems (1974), algorithm 23.10 (NNLS): the column that reduces the residual most becomes
@@ -60,7 +59,9 @@ def solve_non_negative(columns: Floats, target: Floats) -> Floats:
     return factors
 
 
-def _solve_subset(columns: Floats, target: Floats, free: Mask) -> Floats:
+def _solve_subset(
+    columns: NDArray[np.float64], target: NDArray[np.float64], free: NDArray[np.bool_]
+) -> NDArray[np.float64]:
     """Return the factors of the free columns by least squares, and 0 for all others."""
     factors = np.zeros(columns.shape[1])
     factors[free] = np.linalg.lstsq(columns[:, free], target, rcond=None)[0]

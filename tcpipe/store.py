@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcpipe.errors import StoreError, UsageError
+from tcpipe.errors import Location, StoreError, UsageError
 from tcpipe.formats.atomic import check_input_path, check_local_output, make_unique_name
 from tcpipe.formats.documents import (
     BLOBS,
@@ -50,7 +50,7 @@ _MARK_OF_1_X = "store.json"
 class Store:
     """A store in a directory, or below a URL."""
 
-    root: Path | str
+    root: Location
 
     @property
     def place(self) -> Place:
@@ -169,7 +169,7 @@ def check_map_name(name: str) -> str:
     return name
 
 
-def is_store(path: Path | str) -> bool:
+def is_store(path: Location) -> bool:
     """Return whether a place is a store: whether it has documents. `UsageError` if it is one of tcpipe 1.x."""
     if is_url(path) and not is_bucket(path):
         return False
@@ -181,7 +181,7 @@ def is_store(path: Path | str) -> bool:
     return any(found)
 
 
-def open_store(root: str | Path, *, create: bool = False) -> Store:
+def open_store(root: Location, *, create: bool = False) -> Store:
     """Return the store at a path or URL; unless with ``create`` it has to be there.
 
     `UsageError`: it is missing, a file, or made by tcpipe 1.x; `StoreError`: it cannot be reached.
@@ -201,7 +201,7 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     return store
 
 
-def is_path(name: Path | str) -> bool:
+def is_path(name: Location) -> bool:
     """Return whether a name is a URL, or that of a file or directory; any other is looked up as a run."""
     if is_url(name):
         return True
@@ -211,7 +211,7 @@ def is_path(name: Path | str) -> bool:
     return False
 
 
-def find_named_runs(name: Path | str, store: Path | str) -> list[StoredRun]:
+def find_named_runs(name: Location, store: Location) -> list[StoredRun]:
     """Return the runs called RUN, under each recipe, or RUN/RECIPE; `UsageError` if the store has none."""
     if str(name) != str(store) and not is_store(store):
         raise UsageError(
@@ -226,7 +226,7 @@ def find_named_runs(name: Path | str, store: Path | str) -> list[StoredRun]:
     return found
 
 
-def find_named_run(name: Path | str, store: Path | str) -> StoredRun:
+def find_named_run(name: Location, store: Location) -> StoredRun:
     """Return the run called RUN or RUN/RECIPE; `UsageError` if the store has none, or several of that name."""
     found = find_named_runs(name, store)
     if len(found) > 1:

@@ -37,7 +37,7 @@ from tcpipe.cli.output import (
     resolve_recipe_with_source,
     show_progress,
 )
-from tcpipe.errors import UsageError
+from tcpipe.errors import Location, UsageError
 from tcpipe.pipeline.options import IngestOptions
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     return summary.exit_code
 
 
-def _list_outcome(result: IngestResult, store: Path | str, *, several: bool, quiet: bool) -> Iterator[str]:
+def _list_outcome(result: IngestResult, store: Location, *, several: bool, quiet: bool) -> Iterator[str]:
     """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken.
 
     With ``quiet`` an unchanged log without a new problem has no line.

@@ -19,7 +19,7 @@ from tcpipe.arrays import Floats, Floats32, Ints
 from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
 from tcpipe.dataset.energies import ENERGIES, Energy, find_energy, name_common_std
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
-from tcpipe.errors import DatasetError, list_first
+from tcpipe.errors import DatasetError, Location, list_first
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     OVERVIEW,
@@ -196,7 +196,7 @@ class Split:
         """Return some samples: their indices, or a mask of shape (N,)."""
         return replace(self, view=replace(self.view, at=self.view.at[np.asarray(chosen)]))
 
-    def select(self, ids: str | Path | Iterable[str]) -> Split:
+    def select(self, ids: Location | Iterable[str]) -> Split:
         """Return the samples with these ``sample_id``s, in the order given.
 
         Parameters
@@ -354,7 +354,7 @@ class Dataset(Mapping[str, Split]):
         """Labels that its samples have: some of energy, time, slip, vibration."""
         return tuple(name for name in LABELS if name not in self.card.absent_labels)
 
-    def select(self, ids: str | Path | Iterable[str]) -> Split:
+    def select(self, ids: Location | Iterable[str]) -> Split:
         """Return samples of any split, in the order given, as `Split.select` does."""
         return self._every.select(ids)
 
@@ -377,7 +377,7 @@ class Dataset(Mapping[str, Split]):
         return table
 
 
-def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label: str = "total") -> Dataset:
+def open_dataset(path: Location, *, layers: Sequence[str] | None = None, label: str = "total") -> Dataset:
     """Open a dataset that ``tcpipe build-dataset`` wrote.
 
     Parameters

@@ -21,7 +21,7 @@ from scipy.special import stdtrit
 from tcpipe import __version__
 from tcpipe.arrays import Floats
 from tcpipe.dataset import open_dataset
-from tcpipe.errors import UsageError, clean_lines
+from tcpipe.errors import Location, UsageError, clean_lines
 from tcpipe.formats.atomic import write_text
 from tcpipe.formats.json_files import read_json, write_json
 from tcpipe.formats.parquet import read_table
@@ -100,8 +100,8 @@ class BenchmarkResult:
 
 
 def run_benchmark(
-    datasets: Sequence[str | Path],
-    out: str | Path,
+    datasets: Sequence[Location],
+    out: Location,
     *,
     kinds: Sequence[ModelKind] = KINDS,
     seeds: int = 5,
@@ -152,7 +152,7 @@ def _is_random(kind: ModelKind) -> bool:
     return kind == "own" or find_kind(kind).stops_by_fold
 
 
-def _train(dataset: str | Path, here: Path, config: FitConfig, predictor: str | None) -> float:
+def _train(dataset: Location, here: Path, config: FitConfig, predictor: str | None) -> float:
     """Train a model, or find that it is there; return how long the training took [s]."""
     result, where = train(dataset, here / "model", config=config, predictor=predictor), here / "training.json"
     if result.status == "done" or not where.is_file():
@@ -160,7 +160,7 @@ def _train(dataset: str | Path, here: Path, config: FitConfig, predictor: str | 
     return float(str(read_json(where)["training_s"]))
 
 
-def _read_runs(dataset: str | Path) -> Mapping[str, str]:
+def _read_runs(dataset: Location) -> Mapping[str, str]:
     """Return the run of each evaluated sample of a dataset."""
     data = open_dataset(dataset)
     columns = [(data[split].column("sample_id"), data[split].column("run_id")) for split in SPLITS]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from tcpipe.errors import DatasetError, UsageError, clean_lines
+from tcpipe.errors import DatasetError, Location, UsageError, clean_lines
 from tcpipe.experiment.benchmark import BenchmarkRow, list_tables, run_benchmark
 from tcpipe.experiment.claims import FEWEST_SEEDS, Claim, check_claims
 from tcpipe.experiment.networks import compare_networks
@@ -107,7 +107,7 @@ class Reproduction:
 
 
 def reproduce(
-    directory: str | Path, *, size: Size = "full", seeds: int = 1, jobs: int = 1, baselines: bool = True
+    directory: Location, *, size: Size = "full", seeds: int = 1, jobs: int = 1, baselines: bool = True
 ) -> Reproduction:
     """Simulate the paper's site, build the dataset, train, evaluate, and compare with the paper's claims.
 

@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from tcpipe.errors import StoreError, UsageError
+from tcpipe.errors import Location, StoreError, UsageError
 
 TEMPORARY_PREFIX = ".tmp-"
 """Prefix of the names of temporaries; readers skip them."""
@@ -357,7 +357,7 @@ _LIKE_A_URL = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
 """Begins a URL, also one that `pathlib.Path` has made ``s3:/bucket`` of."""
 
 
-def check_local_output(path: str | Path) -> Path:
+def check_local_output(path: Location) -> Path:
     """Return where something is written. `UsageError`: it is a URL, of which a local directory ``s3:`` would become."""
     found = _LIKE_A_URL.match(str(path))
     if found and "://" in str(path):
@@ -367,17 +367,17 @@ def check_local_output(path: str | Path) -> Path:
     return Path(path)
 
 
-def check_output_directory(path: str | Path) -> Path:
+def check_output_directory(path: Location) -> Path:
     """Return where a directory is written; `UsageError` if a file or a URL is in the way."""
     return _check_output(path, "file", "is a file, expected a directory; give another")
 
 
-def check_output_file(path: str | Path) -> Path:
+def check_output_file(path: Location) -> Path:
     """Return where a file is written; `UsageError` if a directory or a URL is in the way."""
     return _check_output(path, "directory", "is a directory, expected the name of a file")
 
 
-def _check_output(path: str | Path, wrong: str, problem: str) -> Path:
+def _check_output(path: Location, wrong: str, problem: str) -> Path:
     place = check_local_output(path)
     if _find_kind(place) == wrong:
         raise UsageError(f"{path}: {problem}")
@@ -387,22 +387,22 @@ def _check_output(path: str | Path, wrong: str, problem: str) -> Path:
     return place
 
 
-def check_input_path(path: str | Path) -> Path:
+def check_input_path(path: Location) -> Path:
     """Return a file or directory that is there; `UsageError` else."""
     return _check_input(path, "file or directory")
 
 
-def check_input_file(path: str | Path) -> Path:
+def check_input_file(path: Location) -> Path:
     """Return a file that is there; `UsageError` else."""
     return _check_input(path, "file")
 
 
-def check_input_directory(path: str | Path) -> Path:
+def check_input_directory(path: Location) -> Path:
     """Return a directory that is there; `UsageError` else."""
     return _check_input(path, "directory")
 
 
-def _check_input(path: str | Path, wanted: str) -> Path:
+def _check_input(path: Location, wanted: str) -> Path:
     kind = _find_kind(Path(path))
     if kind is None:
         why = "; it is read from this machine only" if _LIKE_A_URL.match(str(path)) else ""

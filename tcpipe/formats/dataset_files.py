@@ -25,7 +25,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Ints
-from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
+from tcpipe.errors import DatasetError, Location, RecipeError, StoreError, UsageError
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import verify_document
 from tcpipe.formats.json_files import parse_typed, read_document
@@ -259,7 +259,7 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
     return parse_card(data, directory / CARD, proved=proved)
 
 
-def parse_card(data: bytes, where: Path | str, *, proved: bool = True) -> DatasetCard:
+def parse_card(data: bytes, where: Location, *, proved: bool = True) -> DatasetCard:
     """Return the card in the bytes of a file; as `read_card`."""
 
     def is_current(card: Mapping[str, object]) -> bool:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from tcpipe.errors import StoreError
+from tcpipe.errors import Location, StoreError
 from tcpipe.formats.json_files import Json, digest, parse_json, parse_typed, read_document, to_plain, write_json
 
 T = TypeVar("T")
@@ -73,7 +73,7 @@ def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Json]], bool] = lamb
 
 
 def verify_document(
-    data: bytes, where: Path | str, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True
+    data: bytes, where: Location, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True
 ) -> dict[str, Json]:
     """Return the JSON object in the bytes of a document that lies at ``where``, proved; as `read_sealed`."""
     remedy = ALL_CHANGES.format(str(where).rpartition("/")[0])
@@ -106,12 +106,12 @@ def seal_page(html: str) -> str:
     return text + _PAGE_SEAL.format(hashlib.sha256(text.encode()).hexdigest())
 
 
-def describe_broken(path: Path | str) -> str:
+def describe_broken(path: Location) -> str:
     """Return the line about a file that is not what its seal or its checksum says."""
     return f"{path}: has changed since it was written: its checksum differs"
 
 
-def find_broken_seal(data: bytes | None, where: Path | str) -> str | None:
+def find_broken_seal(data: bytes | None, where: Location) -> str | None:
     """Return in one line why a sealed file (``.json``, ``.html``) at ``where`` is not as it was written; None if it is."""
     if data is None:
         return f"{where}: is missing"
@@ -119,7 +119,7 @@ def find_broken_seal(data: bytes | None, where: Path | str) -> str | None:
     return None if is_whole else describe_broken(where)
 
 
-def find_wrong_checksum(where: Path | str, found: Checksum | None, wanted: Checksum | None) -> str | None:
+def find_wrong_checksum(where: Location, found: Checksum | None, wanted: Checksum | None) -> str | None:
     """Return in one line how a file differs from what a document has of it (None: nothing), None if it does not."""
     if found is None:
         return f"{where}: is missing"

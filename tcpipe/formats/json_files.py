@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from tcpipe.errors import StoreError
+from tcpipe.errors import Location, StoreError
 from tcpipe.formats.atomic import write_text
 
 T = TypeVar("T")
@@ -101,7 +101,7 @@ def read_document(path: Path) -> bytes:
 
 
 def parse_json(
-    data: bytes, path: Path | str, *, remedy: str = "; remove it and run the command again"
+    data: bytes, path: Location, *, remedy: str = "; remove it and run the command again"
 ) -> dict[str, Json]:
     """Return the object in the bytes of a file; `StoreError` if it holds none."""
     try:
@@ -118,7 +118,7 @@ def read_as(path: Path, cls: type[T]) -> T:
     return parse_typed(read_json(path), cls, path)
 
 
-def parse_typed(value: object, cls: type[T], path: Path | str) -> T:
+def parse_typed(value: object, cls: type[T], path: Location) -> T:
     """Return a JSON object as a dataclass: a key that it lacks is its default, one that the dataclass lacks is left aside.
 
     `StoreError`: a value is missing, or of another type; the line names ``path`` and the key.
@@ -130,7 +130,7 @@ def parse_typed(value: object, cls: type[T], path: Path | str) -> T:
         raise StoreError(f"{path}: is not what this version writes: {_format_validation_error(str(error))}") from None
 
 
-def parse_typed_json(text: str | bytes | memoryview, cls: type[T], path: Path | str) -> T:
+def parse_typed_json(text: str | bytes | memoryview, cls: type[T], path: Location) -> T:
     """Return JSON text as a dataclass, or what is made of such; as `parse_typed`."""
     try:
         with _CONVERTING:

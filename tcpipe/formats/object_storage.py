@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import unquote
 
-from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, hide_secrets, split_secrets
+from tcpipe.errors import Location, LogError, StoreError, TcpipeError, UsageError, hide_secrets, split_secrets
 from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
 
 if TYPE_CHECKING:
@@ -129,17 +129,17 @@ def split_into_pieces(size_bytes: int) -> Iterator[tuple[int, int]]:
         yield start, min(start + _PIECE_BYTES, size_bytes)
 
 
-def is_url(text: str | Path) -> bool:
+def is_url(text: Location) -> bool:
     """Return whether a text names something in object storage rather than a path."""
     return _URL.match(str(text)) is not None
 
 
-def make_absolute(place: str | Path) -> str:
+def make_absolute(place: Location) -> str:
     """Return a path in full, or a URL as it is."""
     return str(place) if is_url(place) else str(Path(place).absolute())
 
 
-def is_bucket(text: str | Path) -> bool:
+def is_bucket(text: Location) -> bool:
     """Return whether a text is a URL in a bucket, which can be listed and written."""
     return str(text).rstrip("/").startswith(("s3://", "gs://", "az://"))
 
@@ -161,12 +161,12 @@ def split_url(url: str, *, one_object: bool = False) -> tuple[str, str]:
     return public, query
 
 
-def format_path(path: str | Path) -> str:
+def format_path(path: Location) -> str:
     """Return a path or the URL of a log as it is shown and stored."""
     return split_url(str(path), one_object=True)[0] if is_url(path) else str(path)
 
 
-def is_presigned(path: str | Path) -> bool:
+def is_presigned(path: Location) -> bool:
     """Return whether this is a URL with a query, without which it cannot be read again."""
     return is_url(path) and bool(split_url(str(path), one_object=True)[1])
 

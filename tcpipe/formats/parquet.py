@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import DTypeLike, NDArray
 
 from tcpipe.arrays import Floats, Ints
-from tcpipe.errors import StoreError
+from tcpipe.errors import Location, StoreError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import to_json_line
 from tcpipe.tables.columns import read_lonlat_deg
@@ -96,7 +96,7 @@ def _add_struct_member(dtype: pa.DataType) -> pa.DataType:
 
 
 @contextmanager
-def _convert_damage(where: Path | str) -> Iterator[None]:
+def _convert_damage(where: Location) -> Iterator[None]:
     """Raise `StoreError` where the file cannot be read."""
     try:
         yield

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 
-from tcpipe.errors import MissingFileError, StoreError
+from tcpipe.errors import Location, MissingFileError, StoreError
 from tcpipe.formats import atomic
 from tcpipe.formats.cache import fetch_cached
 from tcpipe.formats.integrity import ALL_CHANGES, Checksum, compute_checksum, find_wrong_checksum
@@ -64,7 +64,7 @@ class FileEntry(NamedTuple):
 class Place:
     """A directory, or a prefix of a bucket; every method raises `StoreError`, in one line, if it cannot read or write."""
 
-    root: Path | str
+    root: Location
     staging: Path | None = None
     """Folder for temporary files on the same file system as ``root``; None means ``root`` itself."""
 
@@ -242,7 +242,7 @@ class Place:
         return Path(self.root) / name
 
 
-def open_place(path: str | Path) -> Place:
+def open_place(path: Location) -> Place:
     """Return the place that a path or a URL names, without any request."""
     return Place(split_url(str(path))[0].rstrip("/") if is_url(path) else Path(path))
 

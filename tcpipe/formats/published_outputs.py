@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import google_crc32c
 
-from tcpipe.errors import StoreError, UsageError
+from tcpipe.errors import Location, StoreError, UsageError
 from tcpipe.formats.atomic import make_lasting_scratch, make_scratch_directory, make_unique_name, write_atomic_directory
 from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.integrity import Checksum, Checksums, compute_short_digest
@@ -119,7 +119,7 @@ def write_output(url: str, card: str) -> Iterator[Path]:
 
 
 @contextmanager
-def open_output(out: str | Path, card: str) -> Iterator[Path]:
+def open_output(out: Location, card: str) -> Iterator[Path]:
     """Yield the directory to write an output into: ``out`` itself, or of a URL one whose files become its newest build."""
     if not is_url(out):
         yield Path(out)
@@ -129,7 +129,7 @@ def open_output(out: str | Path, card: str) -> Iterator[Path]:
 
 
 @contextmanager
-def publish_directory(out: str | Path, card: str) -> Iterator[Path]:
+def publish_directory(out: Location, card: str) -> Iterator[Path]:
     """Yield an empty directory whose files, a card among them, become ``out`` at the end, or the newest build at a URL."""
     with (
         write_output(str(out).rstrip("/"), card)
@@ -257,7 +257,7 @@ class FetchedShards:
         return found
 
 
-def fetch_directory(path: str | Path) -> Path:
+def fetch_directory(path: Location) -> Path:
     """Return a directory of this machine: the one that is named, or a copy, for this process, of the files that a card in a bucket lists.
 
     `UsageError`: there is no card at the URL; `StoreError`: it cannot be read, or a file differs from its checksum.
@@ -265,7 +265,7 @@ def fetch_directory(path: str | Path) -> Path:
     return fetch_directory_by_range(path, by_range=lambda _: False)[0]
 
 
-def fetch_directory_by_range(path: str | Path, *, by_range: Callable[[str], bool]) -> tuple[Path, FetchedShards | None]:
+def fetch_directory_by_range(path: Location, *, by_range: Callable[[str], bool]) -> tuple[Path, FetchedShards | None]:
     """Return a directory as `fetch_directory`, without the files that are ``by_range``, and where these are read; None on this machine."""
     if not is_url(path):
         return Path(path), None

@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from tcpipe.errors import RecipeError
+from tcpipe.errors import Location, RecipeError
 from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.recipe import IngestSections, Recipe, TableMapping
 from tcpipe.recipe.checking import TO_MEASURE, as_toml, describe, format_values, from_values, read_annotations
@@ -55,7 +55,7 @@ def load_recipe(path: Path | None) -> Recipe:
         raise RecipeError(f"{path}: not valid TOML: {error}") from None
 
 
-def resolve_recipe(given: Recipe | str | Path | None) -> Recipe:
+def resolve_recipe(given: Recipe | Location | None) -> Recipe:
     """Return a recipe: the one given, itself or by its path, else the one that rules here, as `find_recipe` says."""
     if isinstance(given, Recipe):
         return given

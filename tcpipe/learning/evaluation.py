@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
@@ -15,7 +14,7 @@ from tcpipe import __version__
 from tcpipe.cost.coverage import Coverage, find_miscalibration, measure_coverage
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import EnergyName
-from tcpipe.errors import DatasetError
+from tcpipe.errors import DatasetError, Location
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.learning.baselines import (
     KIND_OF_BASELINE,
@@ -206,8 +205,8 @@ Said = Mapping[str, Predicted]
 
 
 def evaluate(
-    model: str | Path,
-    dataset: str | Path,
+    model: Location,
+    dataset: Location,
     config: EvaluateConfig,
     *,
     key: str,

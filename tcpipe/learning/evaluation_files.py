@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tcpipe import __version__
-from tcpipe.errors import UsageError, clean_lines
+from tcpipe.errors import Location, UsageError, clean_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.finding_lines import format_findings, list_verdict
@@ -89,9 +89,9 @@ class EvaluationResult:
 
 
 def run_evaluation(
-    model: str | Path,
-    dataset: str | Path,
-    out: str | Path = "evaluation",
+    model: Location,
+    dataset: Location,
+    out: Location = "evaluation",
     *,
     config: EvaluateConfig | None = None,
     predictor: str | None = None,
@@ -125,7 +125,7 @@ def _check_directory(place: Path) -> None:
         raise UsageError(f"{place}: exists and is no evaluation; it is not changed; give another OUT")
 
 
-def _read_known(out: str | Path, key: str) -> EvaluationResult | None:
+def _read_known(out: Location, key: str) -> EvaluationResult | None:
     """Return the evaluation in a directory, or the newest one at a URL, if it has this key and all of its files."""
     found = find_newest(str(out), [JSON])
     if found is None or {JSON, PAGE, SAMPLES} - set(found.place.list()):
@@ -136,7 +136,7 @@ def _read_known(out: str | Path, key: str) -> EvaluationResult | None:
     return EvaluationResult(found.place.where(), parse_typed(values, Evaluation, where))
 
 
-def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, own: list[str]) -> str:
+def _make_key(model: Location, dataset: Location, config: EvaluateConfig, own: list[str]) -> str:
     """Return the hash that identifies an evaluation."""
     lines = [
         seal_document(read_model_card(fetch_directory(model))),

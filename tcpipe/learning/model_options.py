@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from tcpipe.errors import Location
 from tcpipe.tables.options import MAP, MODEL, PREDICTOR, RECIPE, SEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class TrainOptions:
     """Options of training; a network option that is None has the default of `tcpipe.learning.fitting.FitConfig`."""
 
-    dataset: str | Path = required(Option(kind="sealed", metavar="DATASET", is_argument=True))
-    out: str | Path = option("model", Option(kind="published", metavar="[OUT]", is_argument=True))
+    dataset: Location = required(Option(kind="sealed", metavar="DATASET", is_argument=True))
+    out: Location = option("model", Option(kind="published", metavar="[OUT]", is_argument=True))
     """The same dataset and options are not trained again."""
     _: KW_ONLY
     model: Literal["auto", "linear", "physics", "boosting", "resnet18"] | None = option(
@@ -32,7 +32,7 @@ class TrainOptions:
         ),
     )  # fmt: skip
     predictor: str | None = option(None, PREDICTOR)
-    recipe: Recipe | str | Path | None = option(None, RECIPE)
+    recipe: Recipe | Location | None = option(None, RECIPE)
     loss: Loss = option(
         "nrmse",
         Option(
@@ -84,15 +84,15 @@ class TrainOptions:
 class EvaluateOptions:
     """Which model is measured on which dataset or drives, and how much of it."""
 
-    model: str | Path = required(MODEL)
-    dataset: str | Path = required(Option(kind="sealed", metavar="DATASET", is_argument=True))
+    model: Location = required(MODEL)
+    dataset: Location = required(Option(kind="sealed", metavar="DATASET", is_argument=True))
     """With drives: the dataset that the model was trained on."""
-    out: str | Path = option("evaluation", Option(kind="published", metavar="[OUT]", is_argument=True))
+    out: Location = option("evaluation", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
     noise_draws: int = option(5, Option("Draws of noise for each ablated input set.", (), Range(1, 1000)))
     seed: int = option(0, Option("Seed of the noise.", kind=SEED))
     predictor: str | None = option(None, PREDICTOR)
-    drive: Sequence[str | Path] = option(
+    drive: Sequence[Location] = option(
         (),
         Option(
             "Evaluate MODEL on a whole drive instead: an ingested log, by its path or the name of its run; repeatable.",
@@ -100,4 +100,4 @@ class EvaluateOptions:
         ),
     )  # fmt: skip
     map: str | None = option(None, MAP)
-    store: str | Path = option("tcpipe-store", STORE)
+    store: Location = option("tcpipe-store", STORE)

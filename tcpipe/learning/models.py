@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tcpipe.arrays import Floats, Floats32, Mask
 from tcpipe.cost.prediction_errors import QuantityErrors, estimate_correlation, fit_errors
 from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
-from tcpipe.errors import ModelError, StoreError, UsageError
+from tcpipe.errors import Location, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import write_text
 from tcpipe.formats.integrity import compute_checksums, read_sealed, seal_document, write_sealed
 from tcpipe.formats.json_files import digest, parse_typed
@@ -145,7 +145,7 @@ class Model:
 
 
 def write_model(
-    out: str | Path, *, card: ModelCard, weights: Arrays, residuals: pa.Table, ground: pa.Table, history: str
+    out: Location, *, card: ModelCard, weights: Arrays, residuals: pa.Table, ground: pa.Table, history: str
 ) -> None:
     """Write a model folder, or the newest build at a URL, complete or not at all."""
     with publish_directory(out, CARD) as directory:
@@ -156,7 +156,7 @@ def write_model(
         write_sealed(directory / CARD, replace(card, checksums=compute_checksums(directory)))
 
 
-def load_model(path: str | Path, predictor: str | None = None) -> Model:
+def load_model(path: Location, predictor: str | None = None) -> Model:
     """Open a model that ``tcpipe train`` wrote; its network is made when it is first asked.
 
     Parameters
@@ -199,7 +199,7 @@ def _add_code(model: Model, predictor: str | None) -> Model:
     return replace(model, own=own, checksum=digest([model.checksum, own.digest]))
 
 
-def choose_model(path: str | Path, *, speed_mps: float | None = None, predictor: str | None = None) -> Model:
+def choose_model(path: Location, *, speed_mps: float | None = None, predictor: str | None = None) -> Model:
     """Return a model as `load_model`, asked for a commanded speed [m/s] if one is given."""
     model = load_model(path, predictor)
     return model if speed_mps is None else set_speed(model, speed_mps)

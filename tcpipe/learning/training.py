@@ -17,7 +17,7 @@ from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import name_common_std
 from tcpipe.dataset.extra_features import ExtraFeature, available_features, read_extra_features
 from tcpipe.dataset.tensor import ONE_HOT
-from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
+from tcpipe.errors import DatasetError, Location, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, read_json
@@ -134,8 +134,8 @@ def is_within_error(difference: Floats, clusters: Ints) -> bool:
 
 
 def train(
-    dataset: str | Path,
-    out: str | Path = "model",
+    dataset: Location,
+    out: Location = "model",
     *,
     config: FitConfig | None = None,
     no_resume: bool = False,
@@ -197,7 +197,7 @@ def train(
     return _make_result(out, "done", card.training, fitted.training_times_s)
 
 
-def _name_checkpoint(out: str | Path, key: str) -> Path:
+def _name_checkpoint(out: Location, key: str) -> Path:
     """Return the file that keeps the state of a training."""
     place = Path(str(out).rstrip("/").rpartition("/")[2]) if is_url(out) else Path(out)
     clear_beside(place)
@@ -312,7 +312,7 @@ def find_training_range(split: Split) -> TrainingRange:
     return TrainingRange(class_counts, tuple(sorted(pixel_classes)), ranges, own)
 
 
-def _read_known_model(out: str | Path, predictor: str | None) -> ModelCard | None:
+def _read_known_model(out: Location, predictor: str | None) -> ModelCard | None:
     """Return the card of the model at ``out``; None without one, or if it is damaged or of another schema."""
     if is_url(out):
         return load_model(out, predictor).card if find_newest(str(out), [CARD]) else None
@@ -327,7 +327,7 @@ def _read_known_model(out: str | Path, predictor: str | None) -> ModelCard | Non
     return None
 
 
-def _reject_other_files(out: str | Path) -> None:
+def _reject_other_files(out: Location) -> None:
     """Raise `UsageError` if the folder contains files that are not part of a model."""
     place = Path(out)
     entries = {entry.name for entry in place.iterdir()} if place.is_dir() else set()
@@ -338,7 +338,7 @@ def _reject_other_files(out: str | Path) -> None:
         )
 
 
-def _make_result(place: Path | str, status: str, training: Training, times: TrainingTimes) -> TrainResult:
+def _make_result(place: Location, status: str, training: Training, times: TrainingTimes) -> TrainResult:
     return TrainResult(
         path=str(place), status=status, model=training.kind, samples=training.samples, epochs=training.epochs,
         best_epoch=training.best_epoch, held_out_loss=training.held_out_loss, device=training.device, training_times_s=times,

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.arrays import Ints
-from tcpipe.errors import FusionError, UsageError, clean_lines
+from tcpipe.errors import FusionError, Location, UsageError, clean_lines
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
@@ -203,12 +203,12 @@ def _make_row(score: WithheldScore) -> tuple[str, ...]:
 
 
 def audit(
-    run: Path | str,
+    run: Location,
     *,
     recipe: Recipe,
     robot: str | None = None,
     message_definitions: Path | None = None,
-    store: Path | str = "tcpipe-store",
+    store: Location = "tcpipe-store",
 ) -> Audit:
     """Withhold fixes in windows, fuse the rest, and score the track by what was withheld.
 
@@ -232,12 +232,12 @@ def audit(
 
 
 def read_audited(
-    run: Path | str,
+    run: Location,
     recipe: Recipe,
     *,
     robot: str | None = None,
     message_definitions: Path | None = None,
-    store: Path | str = "tcpipe-store",
+    store: Location = "tcpipe-store",
 ) -> tuple[Streams, FuseConfig]:
     """Return the streams of a log or of a run of a store, and how these are fused; parameters and errors as for `audit`."""
     if not is_path(run):

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints, Mask
-from tcpipe.errors import clean_lines
+from tcpipe.errors import Location, clean_lines
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, RecordChange, compare_records, format_value
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches, read_card, read_samples, sample_columns
 from tcpipe.formats.finding_lines import format_findings
@@ -63,7 +63,7 @@ class Difference:
 _CHANGES = ("only in a", "only in b", "other labels", "other columns", "other patches", "other fold")
 
 
-def diff(a: str | Path, b: str | Path) -> Difference:
+def diff(a: Location, b: Location) -> Difference:
     """Compare two datasets; `DatasetError` if either is no dataset."""
     first, second = fetch_directory(a), fetch_directory(b)
     cards = read_card(first), read_card(second)

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError, StoreError, clean_lines
+from tcpipe.errors import DatasetError, Location, StoreError, clean_lines
 from tcpipe.formats.dataset_card import DatasetCard, MapSource
 from tcpipe.formats.dataset_files import (
     SAMPLES,
@@ -125,7 +125,7 @@ class Explained:
         return clean_lines(tuple(_iterate_lines(self.sample_id, self.facts)))
 
 
-def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Path = "tcpipe-store") -> Explained:
+def explain(sample_id: str, *, dataset: Location = "dataset", store: Location = "tcpipe-store") -> Explained:
     """Return where a sample of a dataset came from.
 
     Raises `DatasetError`, `StoreError`: there is no such dataset, sample or store, the dataset is of another data model, or the store no

@@ -13,7 +13,7 @@ from typing import Literal
 import pyarrow as pa
 
 from tcpipe import __version__
-from tcpipe.errors import LogError, StoreError, UsageError
+from tcpipe.errors import Location, LogError, StoreError, UsageError
 from tcpipe.formats.atomic import clear
 from tcpipe.formats.json_files import read_as, write_json
 from tcpipe.formats.logs.log_file import Log
@@ -88,7 +88,7 @@ class Exported:
 
 
 def export(
-    log_path: Path | str,
+    log_path: Location,
     out: Path,
     *,
     topics: Sequence[str] = (),

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from tcpipe import __version__
-from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, clean_line, list_first
+from tcpipe.errors import Location, LogError, StoreError, TcpipeError, UsageError, clean_line, list_first
 from tcpipe.execution import refuse_import_of_script, run_all
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key
@@ -49,7 +49,7 @@ from tcpipe.tables.options import as_function
 
 
 def make_tasks(
-    sources: Iterable[LogSource], options: IngestOptions, root: Path | str, recipe: Recipe
+    sources: Iterable[LogSource], options: IngestOptions, root: Location, recipe: Recipe
 ) -> list[IngestTask]:
     """Return the task of each log; on a cluster, whose workers are elsewhere, with absolute paths."""
     definitions = None if options.msgdef is None else Path(options.msgdef)
@@ -84,7 +84,7 @@ _NO_LOGS = "no logs given; expected .mcap, .bag or .db3 files, ROS 2 bag directo
 class IngestSummary:
     """Results of the logs in the order given; ``exit_code`` is the contract's."""
 
-    store: Path | str
+    store: Location
     results: tuple[IngestResult, ...] = field(default_factory=tuple)
 
     @property

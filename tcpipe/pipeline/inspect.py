@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from tcpipe.errors import StoreError, TcpipeError, UsageError
+from tcpipe.errors import Location, StoreError, TcpipeError, UsageError
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.logs.log_file import list_logs_below
@@ -102,13 +102,13 @@ Inspected: TypeAlias = (
 
 
 def inspect(
-    path: Path | str,
+    path: Location,
     *,
     recipe: Recipe,
     robot: str | None = None,
     full: bool = False,
     message_definitions: Path | None = None,
-    store: Path | str = "tcpipe-store",
+    store: Location = "tcpipe-store",
 ) -> Inspected:
     """Return the content of a path or a run of the store; with ``full`` read every message of a log, for damage, gaps and clocks.
 
@@ -135,7 +135,7 @@ def inspect(
     return _inspect_logs_or_tables(path, recipe, ask)
 
 
-def _inspect_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> Inspected:
+def _inspect_url(url: str, ask: Callable[[Location], InspectedLog]) -> Inspected:
     if is_presigned(url):
         return ask(url)
     if not is_log_file(url):  # of a log nothing else need be readable
@@ -159,7 +159,7 @@ def _inspect_dataset(directory: Path, name: str) -> InspectedDataset:
 
 
 def _inspect_logs_or_tables(
-    path: Path, recipe: Recipe, ask: Callable[[Path | str], InspectedLog]
+    path: Path, recipe: Recipe, ask: Callable[[Location], InspectedLog]
 ) -> InspectedLog | InspectedLogs | InspectedTables:
     of_tables = [files[0] for files in find_table_logs(path, recipe.tables)]
     if path.is_dir():
@@ -172,7 +172,7 @@ def _inspect_logs_or_tables(
 
 
 def _inspect_logs_at(
-    logs: Sequence[Path | str], path: Path | str, ask: Callable[[Path | str], InspectedLog]
+    logs: Sequence[Location], path: Location, ask: Callable[[Location], InspectedLog]
 ) -> InspectedLog | InspectedLogs:
     if not logs:
         raise UsageError(f"{path}: is no map, dataset, run or store, and contains no log")
@@ -182,13 +182,13 @@ def _inspect_logs_at(
 
 
 def _inspect_one(
-    path: Path | str, *, recipe: Recipe, robot: str | None, full: bool, message_definitions: Path | None
+    path: Location, *, recipe: Recipe, robot: str | None, full: bool, message_definitions: Path | None
 ) -> InspectedLog:
     with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as log:
         return replace(inspect_log(log, recipe, robot, full=full), path=format_path(path))
 
 
-def _try_inspect(path: Path | str, ask: Callable[[Path | str], InspectedLog]) -> InspectedLog:
+def _try_inspect(path: Location, ask: Callable[[Location], InspectedLog]) -> InspectedLog:
     try:
         return ask(path)
     except TcpipeError as error:

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from tcpipe.errors import LogError, StoreError, clean_line
+from tcpipe.errors import Location, LogError, StoreError, clean_line
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.log_file import find_logs, list_logs_below
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
@@ -60,7 +60,7 @@ class LogSource:
         """Where the files are."""
         return self.urls or tuple(str(path) for path in self.paths)
 
-    def locations(self) -> tuple[Path | str, ...]:
+    def locations(self) -> tuple[Location, ...]:
         """Return what the files are opened by: paths and URLs, with the queries of those that are presigned."""
         queries = self.queries or ("",) * len(self.origins)
         whole = (f"{at}?{query}" if query else at for at, query in zip(self.origins, queries, strict=True))
@@ -121,7 +121,7 @@ class FoundLogs:
 
 
 def list_log_sources(
-    logs: Iterable[str | Path], *, as_one: bool, staging: Path, tables: Mappings | None = None
+    logs: Iterable[Location], *, as_one: bool, staging: Path, tables: Mappings | None = None
 ) -> FoundLogs:
     """Return the logs at or below the given paths.
 

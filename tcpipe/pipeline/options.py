@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
+from tcpipe.errors import Location
 from tcpipe.tables.options import (
     DRY_RUN,
     MESSAGE_DEFINITIONS,
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 class IngestOptions:
     """Which logs are ingested, into which store, and how."""
 
-    logs: Iterable[str | Path] = required(Option(kind="several", metavar="LOG...", repeatable=True, is_argument=True))
+    logs: Iterable[Location] = required(Option(kind="several", metavar="LOG...", repeatable=True, is_argument=True))
     """Files, ROS 2 bag directories, folders searched downward, or URLs of such (``s3://…``), which are read by range or copied."""
     _: KW_ONLY
-    store: str | Path = option("tcpipe-store", STORE)
-    recipe: Recipe | str | Path | None = option(None, RECIPE)
+    store: Location = option("tcpipe-store", STORE)
+    recipe: Recipe | Location | None = option(None, RECIPE)
     robot: str | None = option(
         None,
         Option(
@@ -56,7 +56,7 @@ class IngestOptions:
     )
     """Workers see logs and store under the same absolute paths."""
     as_one: bool = option(False, Option("Treat all logs as parts of one drive (split logs; power in a separate log)."))
-    msgdef: str | Path | None = option(None, MESSAGE_DEFINITIONS)
+    msgdef: Location | None = option(None, MESSAGE_DEFINITIONS)
     shard: tuple[int, int] | None = option(
         None,
         Option(
@@ -87,7 +87,7 @@ class IngestOptions:
     """Called with a line that is said before the first result: that the store is new."""
 
 
-Files: TypeAlias = "str | Path | Sequence[str | Path]"
+Files: TypeAlias = Location | Sequence[Location]
 """A file, a pattern of files such as ``dem/*.tif`` (its files by name), or several of both: tiles of one grid, the last on top."""
 
 
@@ -107,7 +107,7 @@ class AddMapOptions:
         None, _raster("Terrain classes: one integer band, or GeoJSON polygons with a property 'class'.")
     )
     """The property is a class name, value or id."""
-    classes: str | Path | None = option(
+    classes: Location | None = option(
         None, Option("Class table: CSV with value,id,name,traversable, or TOML.", (), "input_file", "FILE")
     )
     """None takes the store's, else the paper's seven classes. The first map with terrain or classes sets the store's table."""
@@ -120,7 +120,7 @@ class AddMapOptions:
             "NAME=FILE",
         ),
     )
-    categorical: Mapping[str, str | Path | None] | None = option(
+    categorical: Mapping[str, Location | None] | None = option(
         None,
         Option(
             "Layer NAME contains classes: named by FILE, like --classes, or by the raster itself.",
@@ -137,17 +137,17 @@ class AddMapOptions:
         None, Option("Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n")
     )
     force: bool = option(False, Option("Replace a map of this name that has other inputs."))
-    store: str | Path = option("tcpipe-store", STORE)
+    store: Location = option("tcpipe-store", STORE)
 
 
 @dataclass(frozen=True, slots=True)
 class BuildDatasetOptions:
     """Which runs and maps a dataset is made from, and how."""
 
-    out: str | Path = option("dataset", Option(kind="published", metavar="[OUT]", is_argument=True))
+    out: Location = option("dataset", Option(kind="published", metavar="[OUT]", is_argument=True))
     """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a folder of its own."""
     _: KW_ONLY
-    split: str | Path | None = option(
+    split: Location | None = option(
         None, Option("GeoJSON region (WGS84): inside is train and test, outside is unseen.", (), "input_file", "FILE")
     )
     """None: everything is train and test."""
@@ -160,8 +160,8 @@ class BuildDatasetOptions:
     )  # fmt: skip
     robot: str | None = option(None, Option("Use only runs of this robot.", (), "robot", "NAME"))
     tag: Mapping[str, str] | None = tags("Use only runs with this tag; if repeated, with all of the tags.")
-    store: str | Path = option("tcpipe-store", STORE)
-    recipe: Recipe | str | Path | None = option(None, RECIPE)
+    store: Location = option("tcpipe-store", STORE)
+    recipe: Recipe | Location | None = option(None, RECIPE)
     jobs: int = jobs("Runs sampled")
     format: FileFormat = option("zarr", Option("Format of the patches.", kind=("zarr", "parquet")))
     holdout: str | None = option(
@@ -171,7 +171,7 @@ class BuildDatasetOptions:
             (), "holdout", "HOW"
         ),
     )  # fmt: skip
-    covariates: str | Path | Sequence[str | Path] = option(
+    covariates: Location | Sequence[Location] = option(
         (),
         Option(
             "Table (CSV or Parquet) that is joined to the samples by time, such as weather or soil; repeatable.",

@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Ints
-from tcpipe.errors import LogError, StoreError, UsageError, clean_lines
+from tcpipe.errors import Location, LogError, StoreError, UsageError, clean_lines
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.formats.parquet import read_table
@@ -63,7 +63,7 @@ class Overlay:
         return clean_lines((f"{self.path}: run {self.run_id} under recipe {self.recipe_id}, on its log's clock", *said))
 
 
-def write_overlay(name: str, out: Path, *, store: Path | str = "tcpipe-store") -> Overlay:
+def write_overlay(name: str, out: Path, *, store: Location = "tcpipe-store") -> Overlay:
     """Write what became of a run as an MCAP of ROS 2 messages, whole or not at all; the same run gives the same bytes.
 
     `UsageError`: there is no run of this name (RUN or RUN/RECIPE), or it is under several recipes, or ``out`` is there and no overlay: a

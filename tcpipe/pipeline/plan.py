@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias, TypeVar, get_args
 
 from tcpipe import __version__
-from tcpipe.errors import TcpipeError, clean_line, hide_secrets
+from tcpipe.errors import Location, TcpipeError, clean_line, hide_secrets
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.recipe_toml import ingest_key
@@ -34,7 +34,7 @@ class IngestTask:
     """One run to make: the log and how."""
 
     source: LogSource
-    store: Path | str
+    store: Location
     recipe: Recipe
     robot: str | None
     tags: Mapping[str, str]

@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 
 from tcpipe.arrays import Ints
-from tcpipe.errors import TcpipeError, clean_lines
+from tcpipe.errors import Location, TcpipeError, clean_lines
 from tcpipe.formats.finding_lines import describe_power, format_findings, format_loss, list_verdict
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
@@ -140,7 +140,7 @@ def _rate(topic: RoleTopic) -> str:
 
 
 def preflight(
-    log: Path | str, *, recipe: Recipe, robot: str | None = None, message_definitions: Path | None = None
+    log: Location, *, recipe: Recipe, robot: str | None = None, message_definitions: Path | None = None
 ) -> Preflight:
     """Return what recording like this promises.
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tcpipe.errors import UsageError, list_first
+from tcpipe.errors import Location, UsageError, list_first
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.runs import Call, Problem, Run, RunFacts, find_problems, make_failure
@@ -90,7 +90,7 @@ def find_stale_outputs(store: Store, state: State) -> Iterator[Problem]:
             yield Problem(found, f"{output.where} {output.inputs}")
 
 
-def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Acknowledged:
+def acknowledge(names: Sequence[str], *, store: Location = "tcpipe-store") -> Acknowledged:
     """Acknowledge the problems of runs, logs, datasets and killed calls: they cause no exit code 3 any more, until the content is another.
 
     A run whose tables are missing is given up: it is not expected any more. A killed call counts as ended.
@@ -166,7 +166,7 @@ def _make_missing_problem(name: str, state: State) -> list[Problem]:
 
 
 def _describe_no_match(
-    name: str, found: Sequence[Problem], candidates: Sequence[Problem], state: State, root: Path | str
+    name: str, found: Sequence[Problem], candidates: Sequence[Problem], state: State, root: Location
 ) -> str:
     if found:
         return f"{name}: {len(found)} logs have this name; give the path of one: {_format_list(found)}"

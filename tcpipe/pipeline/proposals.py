@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow.compute as pc
 
 from tcpipe.arrays import Floats
-from tcpipe.errors import LogError, TcpipeError, UsageError, clean_line
+from tcpipe.errors import Location, LogError, TcpipeError, UsageError, clean_line
 from tcpipe.formats.finding_lines import describe_finding, format_number
 from tcpipe.formats.logs.log_file import list_logs_below
 from tcpipe.formats.logs.log_joining import open_single_log
@@ -131,7 +131,7 @@ _CODES_NOTE = "if these are its codes; else rtklib, ublox, mavlink, navsat, gps_
 
 
 def propose_recipe(
-    path: Path | str, *, robot: str | None = None, message_definitions: Path | None = None
+    path: Location, *, robot: str | None = None, message_definitions: Path | None = None
 ) -> ProposedRecipe:
     """Return the recipe for a log, or the first of a folder's, or the tables in a folder, whatever recipe there is.
 

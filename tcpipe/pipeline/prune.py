@@ -10,9 +10,8 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from pathlib import Path
 
-from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
+from tcpipe.errors import Location, StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
 from tcpipe.formats.dataset_files import CARD, parse_card
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
@@ -77,8 +76,8 @@ class Pruned:
 def prune(
     runs: Sequence[str] = (),
     *,
-    store: str | Path = "tcpipe-store",
-    recipe: Recipe | str | Path | None = None,
+    store: Location = "tcpipe-store",
+    recipe: Recipe | Location | None = None,
     forget: Sequence[str] = (),
     dry_run: bool = False,
 ) -> Pruned:

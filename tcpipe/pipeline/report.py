@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError, StoreError, UsageError
+from tcpipe.errors import DatasetError, Location, StoreError, UsageError
 from tcpipe.formats.dataset_files import CARD, read_card, read_intact_card
 from tcpipe.formats.documents import BLOBS, State
 from tcpipe.formats.finding_lines import group_findings
@@ -52,10 +52,10 @@ class Page:
 
 
 def report(
-    path: Path | str,
+    path: Location,
     *,
-    store: Path | str = "tcpipe-store",
-    recipe: Recipe | Path | str | None = None,
+    store: Location = "tcpipe-store",
+    recipe: Recipe | Location | None = None,
     runs: bool = True,
 ) -> list[Page]:
     """Write ``report.html`` into a dataset or a store, here or at a URL, or beside the tables of a run of the store; return the pages.
@@ -138,7 +138,7 @@ def _find_unchanged_page(run: StoredRun, made_from: str) -> Page | None:
     return None
 
 
-def _report_dataset(path: Path | str) -> Page:
+def _report_dataset(path: Location) -> Page:
     directory, fetched = fetch_directory_by_range(path, by_range=lambda _: False)
     html = render_dataset_report(directory, None if is_url(path) else directory.absolute().parent)
     place = open_place(path) if fetched is None else fetched.place

@@ -9,10 +9,9 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from pathlib import Path
 from typing import TypeAlias
 
-from tcpipe.errors import UsageError, clean_lines
+from tcpipe.errors import Location, UsageError, clean_lines
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.documents import State
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_finding, group_findings
@@ -171,7 +170,7 @@ def _list_asked(state: State) -> Asked:
 
 
 def _find_tasks(
-    options: IngestOptions, asked: Asked, root: Path | str, recipe: Recipe
+    options: IngestOptions, asked: Asked, root: Location, recipe: Recipe
 ) -> tuple[list[IngestTask], dict[str, tuple[str, ...]]]:
     """Return the tasks of the logs given, or of those of earlier calls with the options of these; and what holds no log."""
     logs = [str(log) for log in options.logs]

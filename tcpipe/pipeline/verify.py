@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
+from tcpipe.errors import Location, StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, find_leftovers, is_abandoned
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD, SAMPLES, find_foreign_files, parse_card
@@ -86,7 +86,7 @@ class Verified:
         return clean_lines((f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems, *self.notes))
 
 
-def verify(path: Path | str, *, store: Path | str = "tcpipe-store") -> Verified:
+def verify(path: Location, *, store: Location = "tcpipe-store") -> Verified:
     """Re-read a dataset, a store, a map, a model or a cost map, all but a map also at a URL; or a run of a ``store`` by its name.
 
     Raises `UsageError`: the path is something else.
@@ -110,7 +110,7 @@ def verify(path: Path | str, *, store: Path | str = "tcpipe-store") -> Verified:
     return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)), tuple(dict.fromkeys(repairs)))
 
 
-def _find_kind(path: Path | str, store: Path | str) -> tuple[str, Iterator[CheckResult]]:
+def _find_kind(path: Location, store: Location) -> tuple[str, Iterator[CheckResult]]:
     """Return what a path is, and its findings, which are made as they are asked for."""
     if not is_url(path) and not Path(path).exists():
         place = Store(store).place

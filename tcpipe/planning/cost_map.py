@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from tcpipe.arrays import Bytes, Floats, Floats32
 from tcpipe.cost.prediction_errors import QuantityErrors
-from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
+from tcpipe.errors import Location, MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, lock_directory, make_scratch_directory, write_text
 from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import digest
@@ -164,7 +164,7 @@ def make_cost_map_key(model: Model, source: MapFile, cell_size_m: float) -> str:
 def make_cost_map(
     model: Model,
     source: MapFile,
-    out: Path | str,
+    out: Location,
     *,
     cell_size_m: float,
     origin_deg: tuple[float, float] | None = None,

@@ -14,7 +14,7 @@ from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
-from tcpipe.errors import ModelError, UsageError, clean_lines
+from tcpipe.errors import Location, ModelError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear
 from tcpipe.formats.dataset_card import list_shifts
 from tcpipe.formats.finding_lines import format_findings, list_verdict
@@ -292,7 +292,7 @@ class DrivesResult:
 
 
 def evaluate_drives(
-    model: Model, data: Dataset, source: MapFile, logs: Sequence[str], *, store: str | Path, out: str | Path
+    model: Model, data: Dataset, source: MapFile, logs: Sequence[str], *, store: Location, out: Location
 ) -> DrivesResult:
     """Compare drives with a model's predictions and write ``drives.json`` into the directory ``out``, or to a URL.
 

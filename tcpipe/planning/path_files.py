@@ -12,7 +12,7 @@ import numpy as np
 from tcpipe.arrays import Floats
 from tcpipe.cost.adaptation import MeasuredRun
 from tcpipe.cost.prediction_errors import COVERAGE
-from tcpipe.errors import MapError, ModelError, StoreError, UsageError, clean_lines
+from tcpipe.errors import Location, MapError, ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature, read_line
@@ -34,7 +34,7 @@ from tcpipe.tables.bits import flag_name
 from tcpipe.tables.findings import Finding, Severity, Subject, make_finding
 
 
-def choose_map(store: str | Path, name: str | None) -> MapFile:
+def choose_map(store: Location, name: str | None) -> MapFile:
     """Return the named map of a store, or its only one; `UsageError` if there are several and none is named."""
     opened = open_store(store)
     state = opened.scan()

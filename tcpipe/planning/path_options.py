@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tcpipe.errors import Location
 from tcpipe.tables.options import MAP, MODEL, PREDICTOR, SPEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
@@ -28,30 +28,30 @@ _CELL_SIZE = Option(
 class PredictPathOptions:
     """Model, map and path of a prediction."""
 
-    model: str | Path = required(MODEL)
-    path: str | Path = required(Option("GeoJSON LineString (WGS84, lon before lat).", (), "input_file", "FILE"))
+    model: Location = required(MODEL)
+    path: Location = required(Option("GeoJSON LineString (WGS84, lon before lat).", (), "input_file", "FILE"))
     _: KW_ONLY
     map: str | None = option(None, MAP)
-    out: str | Path | None = option(
+    out: Location | None = option(
         None, Option("Write the table of path segments: .csv or .geojson.", (), "output_file", "FILE")
     )
     speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
-    adapt: str | Path | None = option(
+    adapt: Location | None = option(
         None,
         Option(
             "Adapt MODEL by the labelled metres of a run, of this or another robot: an ingested log, by its path or its run's name.",
             metavar="RUN",
         ),
     )  # fmt: skip
-    store: str | Path = option("tcpipe-store", STORE)
+    store: Location = option("tcpipe-store", STORE)
 
 
 @dataclass(frozen=True, slots=True)
 class PlanPathOptions:
     """End points, model and objective of a plan."""
 
-    model: str | Path = required(MODEL)
+    model: Location = required(MODEL)
     start: tuple[float, float] = required(
         Option("Start of the path (WGS84, degrees).", ("--from", "--start"), "lonlat")
     )
@@ -59,8 +59,8 @@ class PlanPathOptions:
     _: KW_ONLY
     objective: Objective = option("energy", Option("Quantity to minimise.", (), ("energy", "time", "distance")))
     map: str | None = option(None, MAP)
-    out: str | Path = option("plan.geojson", Option("Write the path as GeoJSON.", (), "output_file", "FILE"))
-    cost_map: str | Path | None = option(
+    out: Location = option("plan.geojson", Option("Write the path as GeoJSON.", (), "output_file", "FILE"))
+    cost_map: Location | None = option(
         None,
         Option(
             "Cost map of this model and map; without one, the cells of all short paths are predicted.",
@@ -90,7 +90,7 @@ class PlanPathOptions:
     origin: tuple[float, float] | None = option(None, _ORIGIN)
     speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
-    store: str | Path = option("tcpipe-store", STORE)
+    store: Location = option("tcpipe-store", STORE)
     on_step: Callable[[int, int], None] | None = None
     """Called with how many blocks of how many are predicted."""
 

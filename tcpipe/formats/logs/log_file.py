@@ -16,7 +16,7 @@ from typing import Self
 
 import pyarrow as pa
 
-from tcpipe.errors import LogError
+from tcpipe.errors import Location, LogError
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs import bag_file, mcap_records, sqlite_file
@@ -72,7 +72,7 @@ _KNOWN_MAGIC = (
 )
 
 
-def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Log:
+def open_log(path: Location, *, message_definitions: Path | None = None) -> Log:
     """Open a .mcap, .bag or .db3 file (by its content, not its name), or a ROS 2 bag directory; `LogError` names any other kind.
 
     ``path`` may be the URL of one (``s3://…``): of an .mcap or .bag with an index only the requested topics are fetched, any other is

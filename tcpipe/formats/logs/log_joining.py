@@ -16,7 +16,7 @@ from typing import TypeAlias
 
 import pyarrow as pa
 
-from tcpipe.errors import LogError
+from tcpipe.errors import Location, LogError
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.logs.log_file import Log, OpenLog, find_autopilot, open_log
 from tcpipe.formats.logs.message_tables import TableLog
@@ -130,10 +130,10 @@ AnyLog: TypeAlias = "Log | JoinedLog | TableLog"
 
 
 def open_logs(
-    paths: Sequence[Path | str], *, message_definitions: Path | None = None, tables: Mappings | None = None
+    paths: Sequence[Location], *, message_definitions: Path | None = None, tables: Mappings | None = None
 ) -> AnyLog:
     """Open one log as `open_single_log`, or several as one; `LogError` when a topic has different types in two of them."""
-    firsts: dict[tuple[Path | str, ...], Path | str] = {}
+    firsts: dict[tuple[Location, ...], Location] = {}
     for path in sorted(paths, key=Path):
         run = find_table_run(path, tables or {})
         firsts.setdefault(run.files if run else (path,), path)
@@ -152,7 +152,7 @@ def open_logs(
 
 
 def open_single_log(
-    path: Path | str, *, message_definitions: Path | None = None, tables: Mappings | None = None
+    path: Location, *, message_definitions: Path | None = None, tables: Mappings | None = None
 ) -> Log | TableLog:
     """Open a log of an autopilot; a folder that is no bag, or a table, by ``tables``; or as `open_log`."""
     with ExitStack() as stack:

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from tcpipe.errors import Location
 from tcpipe.formats.documents import parse_name
 from tcpipe.formats.logs.rosbag2 import METADATA
 from tcpipe.recipe import TableMapping
@@ -68,7 +69,7 @@ def find_table_logs(path: Path, mappings: Mappings) -> list[tuple[Path, ...]]:
     return found
 
 
-def find_table_run(path: Path | str, mappings: Mappings) -> TableRun | None:
+def find_table_run(path: Location, mappings: Mappings) -> TableRun | None:
     """Return the run that a table belongs to by its name, None where the recipe maps no file of such a name.
 
     The tables of a run are in one folder; the text of a ``*`` is the same in the names of all of them.

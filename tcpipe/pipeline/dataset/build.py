@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from tcpipe.errors import DatasetError, StoreError, TcpipeError, UsageError, clean_lines, list_first
+from tcpipe.errors import DatasetError, Location, StoreError, TcpipeError, UsageError, clean_lines, list_first
 from tcpipe.execution import refuse_import_of_script
 from tcpipe.formats.atomic import check_local_output, clear_beside
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
@@ -135,7 +135,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     return result
 
 
-def _plan(state: State, store: Store, options: BuildDatasetOptions, place: Path | str) -> BuildResult:
+def _plan(state: State, store: Store, options: BuildDatasetOptions, place: Location) -> BuildResult:
     """Return what a call would do."""
     job = _read_job(state, store, options, place)
     if job.is_made and job.known is not None:
@@ -159,7 +159,7 @@ class _Job:
     """Whether that is what would be made now."""
 
 
-def _read_job(state: State, store: Store, options: BuildDatasetOptions, place: Path | str) -> _Job:
+def _read_job(state: State, store: Store, options: BuildDatasetOptions, place: Location) -> _Job:
     known, is_intact = _read_card_in_bucket(place) if isinstance(place, str) else _read_card_in_place(place)
     marks = read_build_options(options, merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed))
     inputs = choose_inputs(store, marks, state)
@@ -174,7 +174,7 @@ def _read_job(state: State, store: Store, options: BuildDatasetOptions, place: P
 
 
 def _build(
-    call: RunningCall, options: BuildDatasetOptions, place: Path | str, *, reported: Collection[str]
+    call: RunningCall, options: BuildDatasetOptions, place: Location, *, reported: Collection[str]
 ) -> tuple[BuildResult, ChosenInputs]:
     """Write the dataset, unless it is there; return the result and its inputs. ``reported`` are findings that are known."""
     if isinstance(place, Path):
@@ -255,7 +255,7 @@ build_dataset = as_function(BuildDatasetOptions, run_build_dataset)
 """`tcpipe.build_dataset`: its keywords are the fields of `BuildDatasetOptions`."""
 
 
-def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> None:
+def _refuse_others_since(place: Location, expected: Container[str | None]) -> None:
     """Raise `StoreError` where another call has put a dataset in this place since."""
     known = None
     if isinstance(place, str):
@@ -268,7 +268,7 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
         )
 
 
-def _find_foreign_files(place: Path | str, card: DatasetCard | None) -> tuple[str, ...]:
+def _find_foreign_files(place: Location, card: DatasetCard | None) -> tuple[str, ...]:
     """Return the files of others in the directory of a dataset; in a bucket each build has a folder of its own."""
     return tuple(find_foreign_files(place, card.checksums)) if isinstance(place, Path) and card is not None else ()
 
@@ -301,7 +301,7 @@ def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
 
 
 def _make_result(
-    place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding], reported: Collection[str]
+    place: Location, status: str, card: DatasetCard, left_out: Sequence[Finding], reported: Collection[str]
 ) -> BuildResult:
     """Return the result, with today's findings on excluded runs in place of the card's; those ``reported`` before are no news."""
     findings = (*left_out, *(finding for finding in card.findings if finding.code not in CHOICE_CODES))
@@ -330,7 +330,7 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
 
 
 @contextmanager
-def _name_remedy(place: Path | str) -> Iterator[None]:
+def _name_remedy(place: Location) -> Iterator[None]:
     """Add to a `DatasetError` about the card in a place what becomes of the dataset there, and what to do."""
     try:
         yield

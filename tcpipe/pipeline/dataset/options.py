@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.errors import DatasetError, RecipeError, UsageError
+from tcpipe.errors import DatasetError, Location, RecipeError, UsageError
 from tcpipe.formats.dataset_files import FileFormat
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.recipe_toml import resolve_recipe
@@ -66,7 +66,7 @@ def parse_labels(given: str | Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in LABELS if name in names)
 
 
-def merge_recipe(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:
+def merge_recipe(recipe: Recipe | Location | None, *, holdout: str | None, seed: int | None) -> Recipe:
     """Return the recipe with the options ``--holdout`` and ``--seed`` in it."""
     recipe = resolve_recipe(recipe)
     kind, _, tag = (holdout or recipe.split.holdout).partition(":")
