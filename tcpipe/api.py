@@ -9,7 +9,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.errors import Location
+from tcpipe.formats.atomic import Location
 from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import PlanPathOptions, PredictPathOptions
 from tcpipe.tables.options import as_function

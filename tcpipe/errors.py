@@ -8,11 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from pathlib import Path
-from typing import Any, TypeAlias
-
-Location: TypeAlias = str | Path
-"""A path of this machine, or the URL of an object or a prefix."""
+from typing import Any
 
 _URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]+:/{1,2})(\S+)", re.IGNORECASE)
 _CLOSING = ")]}'\",;:."

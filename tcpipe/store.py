@@ -18,8 +18,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcpipe.errors import Location, StoreError, UsageError
-from tcpipe.formats.atomic import check_input_path, check_local_output, make_unique_name
+from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.atomic import Location, check_input_path, check_local_output, make_unique_name
 from tcpipe.formats.documents import (
     BLOBS,
     KINDS,

@@ -37,7 +37,8 @@ from tcpipe.cli.output import (
     resolve_recipe_with_source,
     show_progress,
 )
-from tcpipe.errors import Location, UsageError
+from tcpipe.errors import UsageError
+from tcpipe.formats.atomic import Location
 from tcpipe.pipeline.options import IngestOptions
 
 if TYPE_CHECKING:

@@ -296,6 +296,7 @@ def fit_and_validate_physics(metres: FitSamples, *, idle_watt: float | None) -> 
     kinds = list(dict.fromkeys(term for term, _ in found.terms))
     whole = float(np.nansum(known.power_watt / known.velocity_mps))
     share = {kind: float(np.nansum(parts[:, [term == kind for term, _ in found.terms]])) / whole for kind in kinds}
+    turned = known.mean_abs_yaw_rate_radps / known.velocity_mps
     return PhysicsFit(
         segments=found.segments,
         terms=tuple(
@@ -311,14 +312,8 @@ def fit_and_validate_physics(metres: FitSamples, *, idle_watt: float | None) -> 
         residual_watt=found.residual_watt,
         energy_share=share,
         held_out=_score_held_out(known, idle_watt),
-        mean_turn_radpm=_compute_mean_turn(known),
+        mean_turn_radpm=float(turned[np.isfinite(turned)].mean()) if np.isfinite(turned).any() else 0.0,
     )
-
-
-def _compute_mean_turn(metres: FitSamples) -> float:
-    """Return the mean turn of a metre [rad/m]; 0 without known rates."""
-    turned = metres.mean_abs_yaw_rate_radps / metres.velocity_mps
-    return float(turned[np.isfinite(turned)].mean()) if np.isfinite(turned).any() else 0.0
 
 
 def _score_held_out(metres: FitSamples, idle_watt: float | None) -> PhysicsScore | None:

@@ -19,7 +19,8 @@ from tcpipe.arrays import Floats, Floats32, Ints
 from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
 from tcpipe.dataset.energies import ENERGIES, Energy, find_energy, name_common_std
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
-from tcpipe.errors import DatasetError, Location, list_first
+from tcpipe.errors import DatasetError, list_first
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     OVERVIEW,

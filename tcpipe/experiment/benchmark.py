@@ -21,8 +21,8 @@ from scipy.special import stdtrit
 from tcpipe import __version__
 from tcpipe.arrays import Floats
 from tcpipe.dataset import open_dataset
-from tcpipe.errors import Location, UsageError, clean_lines
-from tcpipe.formats.atomic import write_text
+from tcpipe.errors import UsageError, clean_lines
+from tcpipe.formats.atomic import Location, write_text
 from tcpipe.formats.json_files import read_json, write_json
 from tcpipe.formats.parquet import read_table
 from tcpipe.learning.baselines import SPLITS

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from tcpipe.errors import DatasetError, Location, UsageError, clean_lines
+from tcpipe.errors import DatasetError, UsageError, clean_lines
 from tcpipe.experiment.benchmark import BenchmarkRow, list_tables, run_benchmark
 from tcpipe.experiment.claims import FEWEST_SEEDS, Claim, check_claims
 from tcpipe.experiment.networks import compare_networks
-from tcpipe.formats.atomic import clear, write_text
+from tcpipe.formats.atomic import Location, clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.evaluation import UNKNOWN_DISTANCE, EvaluateConfig, Evaluation
 from tcpipe.learning.fitting import FitConfig

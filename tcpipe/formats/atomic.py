@@ -23,8 +23,12 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TypeAlias
 
-from tcpipe.errors import Location, StoreError, UsageError
+from tcpipe.errors import StoreError, UsageError
+
+Location: TypeAlias = str | Path
+"""A path of this machine, or the URL of an object or a prefix."""
 
 TEMPORARY_PREFIX = ".tmp-"
 """Prefix of the names of temporaries; readers skip them."""

@@ -52,7 +52,14 @@ def format_croissant(card: DatasetCard, samples: pa.Schema, files: Mapping[str, 
         kind = {"name": "shards", "encodingFormat": _ENCODING_BY_SUFFIX[".parquet"], "includes": f"{SHARDS}/*.parquet"}
         sets.append({"@type": "cr:FileSet", "@id": "shards", **kind})
         layers = read_layers(card.layers, card.classes, Path())
-        patches = [_patch_field(layer.name, card.patch_px**2, layer.stored.kind) for layer in layers.values()]
+        patches = [
+            pa.field(
+                layer.name,
+                pa.list_(pa.float32() if layer.stored.kind == "f" else pa.uint16(), card.patch_px**2),
+                metadata={"doc": f"layer {layer.name} as stored; dataset.json describes the decoding"},
+            )
+            for layer in layers.values()
+        ]
         columns = pa.schema([samples.field("sample_id"), samples.field("split"), *patches])
         about = "One record a sample with its patch, split by split: rows of the patch one after another."
         records.append(_describe_records("patches", about, columns, {"fileSet": {"@id": "shards"}}))
@@ -94,14 +101,6 @@ def _describe_records(name: str, about: str, columns: pa.Schema, source: Mapping
         # Croissant has no type for binary columns.
         "field": [_describe_field(name, field, source) for field in columns if not pa.types.is_binary(field.type)],
     }
-
-
-def _patch_field(layer: str, values: int, kind: str) -> pa.Field:
-    return pa.field(
-        layer,
-        pa.list_(pa.float32() if kind == "f" else pa.uint16(), values),
-        metadata={"doc": f"layer {layer} as stored; dataset.json describes the decoding"},
-    )
 
 
 def _describe_field(records: str, field: pa.Field, source: Mapping[str, Json]) -> Json:

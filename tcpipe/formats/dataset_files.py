@@ -25,7 +25,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Ints
-from tcpipe.errors import DatasetError, Location, RecipeError, StoreError, UsageError
+from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import verify_document
 from tcpipe.formats.json_files import parse_typed, read_document

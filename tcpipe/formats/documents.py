@@ -278,7 +278,10 @@ def _scan(place: Place, decoded: dict[str, Record]) -> State:
         facts = {
             name: indexed.get(name) or fresh.get(name) or to_compact_json(decoded[name]) for name in names_that_count
         }
-        _write_index(place, facts)
+        columns = [pa.array([*facts], pa.string()), pa.array([*facts.values()], pa.binary())]
+        table = pa.Table.from_arrays(columns, ["name", "facts"]).replace_schema_metadata({_SEAL: _seal(facts)})
+        with suppress(StoreError):  # a reader may not write here
+            place.put(INDEX, write_parquet_bytes(table))
     return state
 
 
@@ -326,13 +329,6 @@ def _parse_index(data: bytes) -> dict[str, bytes]:
         if (table.schema.metadata or {}).get(_SEAL) == _seal(rows):
             return rows
     return {}
-
-
-def _write_index(place: Place, rows: Mapping[str, bytes]) -> None:
-    columns = [pa.array([*rows], pa.string()), pa.array([*rows.values()], pa.binary())]
-    table = pa.Table.from_arrays(columns, ["name", "facts"]).replace_schema_metadata({_SEAL: _seal(rows)})
-    with suppress(StoreError):  # a reader may not write here
-        place.put(INDEX, write_parquet_bytes(table))
 
 
 def _seal(rows: Mapping[str, bytes]) -> bytes:

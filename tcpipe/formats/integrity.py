@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from tcpipe.errors import Location, StoreError
+from tcpipe.errors import StoreError
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.json_files import Json, digest, parse_json, parse_typed, read_document, to_plain, write_json
 
 T = TypeVar("T")

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from tcpipe.errors import Location, StoreError
-from tcpipe.formats.atomic import write_text
+from tcpipe.errors import StoreError
+from tcpipe.formats.atomic import Location, write_text
 
 T = TypeVar("T")
 Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]

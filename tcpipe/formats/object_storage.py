@@ -20,8 +20,8 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import unquote
 
-from tcpipe.errors import Location, LogError, StoreError, TcpipeError, UsageError, hide_secrets, split_secrets
-from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
+from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, hide_secrets, split_secrets
+from tcpipe.formats.atomic import Location, describe_full_disk, make_scratch_directory
 
 if TYPE_CHECKING:
     from obstore import GetOptions, ObjectMeta
@@ -320,14 +320,6 @@ def _describe_no_answer(error: Exception) -> str:
     return f"no answer from {where}: {answer}; check that it runs and that the address is right"
 
 
-def _check_endpoints(scheme: str) -> None:
-    """Raise `ValueError` where an endpoint is no address: obstore would end the process."""
-    for name in _ENDPOINT_VARIABLES:
-        value = os.environ.get(name) or os.environ.get(name.lower())
-        if scheme == "s3" and value and not _ENDPOINT.fullmatch(value):
-            raise ValueError(f"{name} is {value!r}, expected http://host or https://host, with :port where it has one")
-
-
 def split_bucket(url: str) -> tuple[str, str]:
     """Return the URL of a bucket, directory or server, and the name of the object or prefix in it."""
     scheme, _, rest = url.partition("://")
@@ -408,12 +400,20 @@ def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], 
     scheme, _, bucket = container.partition("://")
     if not bucket:
         raise ValueError(f"it names no bucket; expected {scheme}://bucket/name")
-    _check_endpoints(scheme)
+    for name in _ENDPOINT_VARIABLES:
+        value = os.environ.get(name) or os.environ.get(name.lower())
+        if scheme == "s3" and value and not _ENDPOINT.fullmatch(value):
+            raise ValueError(f"{name} is {value!r}, expected http://host or https://host, with :port where it has one")
     options: dict[str, Any] = {}
     if scheme != "file":  # who names an endpoint without TLS means it
         client = {"allow_http": True, "connect_timeout": timedelta(seconds=3)}
         client |= {"timeout": timedelta(seconds=_FIRST_S)} if is_first else {}
-        limit_s = 60.0 * _read_retry_minutes()
+        given = os.environ.get("TCPIPE_RETRY_MINUTES", _RETRY_MINUTES)
+        if not re.fullmatch(r"\d{1,5}(\.\d*)?", given):
+            raise ValueError(
+                f"TCPIPE_RETRY_MINUTES is {given!r}, expected a number of minutes, such as {_RETRY_MINUTES}"
+            )
+        limit_s = 60.0 * float(given)
         limit_s = min(limit_s, _FIRST_RETRY_S) if is_first else limit_s
         backoff = {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=3), "base": 2}
         retry = {"max_retries": _MAX_RETRIES, "retry_timeout": timedelta(seconds=limit_s), "backoff": backoff}
@@ -422,13 +422,6 @@ def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], 
     if query:  # also where the host is a bucket's: the query stands for the credentials
         return obstore.store.HTTPStore.from_url(f"{container}?{query}", **options)
     return obstore.store.from_url(container, **options)
-
-
-def _read_retry_minutes() -> float:
-    given = os.environ.get("TCPIPE_RETRY_MINUTES", _RETRY_MINUTES)
-    if not re.fullmatch(r"\d{1,5}(\.\d*)?", given):
-        raise ValueError(f"TCPIPE_RETRY_MINUTES is {given!r}, expected a number of minutes, such as {_RETRY_MINUTES}")
-    return float(given)
 
 
 def _iterate_objects(store: ObjectStore, url: str, query: str, wanted: Callable[[str], bool]) -> Iterator[StoredObject]:

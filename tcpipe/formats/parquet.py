@@ -22,8 +22,8 @@ import pyarrow.parquet as pq
 from numpy.typing import DTypeLike, NDArray
 
 from tcpipe.arrays import Floats, Ints
-from tcpipe.errors import Location, StoreError
-from tcpipe.formats.atomic import write_atomic_file
+from tcpipe.errors import StoreError
+from tcpipe.formats.atomic import Location, write_atomic_file
 from tcpipe.formats.json_files import to_json_line
 from tcpipe.tables.columns import read_lonlat_deg
 from tcpipe.tables.levels import GEOMETRY, Datum

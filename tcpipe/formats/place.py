@@ -16,8 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 
-from tcpipe.errors import Location, MissingFileError, StoreError
+from tcpipe.errors import MissingFileError, StoreError
 from tcpipe.formats import atomic
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.cache import fetch_cached
 from tcpipe.formats.integrity import ALL_CHANGES, Checksum, compute_checksum, find_wrong_checksum
 from tcpipe.formats.object_storage import (

@@ -23,8 +23,14 @@ from typing import NamedTuple
 
 import google_crc32c
 
-from tcpipe.errors import Location, StoreError, UsageError
-from tcpipe.formats.atomic import make_lasting_scratch, make_scratch_directory, make_unique_name, write_atomic_directory
+from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.atomic import (
+    Location,
+    make_lasting_scratch,
+    make_scratch_directory,
+    make_unique_name,
+    write_atomic_directory,
+)
 from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.integrity import Checksum, Checksums, compute_short_digest
 from tcpipe.formats.json_files import parse_json, parse_typed, parse_typed_json, to_json

@@ -14,7 +14,8 @@ from tcpipe import __version__
 from tcpipe.cost.coverage import Coverage, find_miscalibration, measure_coverage
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import EnergyName
-from tcpipe.errors import DatasetError, Location
+from tcpipe.errors import DatasetError
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.learning.baselines import (
     KIND_OF_BASELINE,
@@ -228,6 +229,7 @@ def evaluate(
         logger.info("%s: %d samples of %s", name, len(found.split), ", ".join(found.names.values()))
 
     baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
+    known = {**load_shipped_profiles().robots, **data.card.recipe.robots}
     evaluation = Evaluation(
         tcpipe_version=__version__,
         key=key,
@@ -236,7 +238,7 @@ def evaluate(
         config=config,
         splits={name: _measure_split(data, part, said[name], spreads[name]) for name, part in sets.items()},
         ablation=tuple(_iterate_ablation(ours, sets, config)),
-        time=_compare_times(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.card.robot, data)),
+        time=_compare_times(ours, sets, said, max_velocity_mps=known.get(ours.card.robot, Robot()).max_velocity_mps),
         baselines=tuple(baselines),
     )
     findings = (*lacking, *_find_mismatches(ours, data, sets), *find_weaknesses(evaluation))
@@ -302,12 +304,6 @@ def _compute_errors(said: Predicted, found: Measured, by: Model) -> dict[str, Er
     spreads = predict_spreads(by, said, found)
     by_class = compute_errors_by_class(said.costs, found.costs, found.class_ids, found.names, spreads)
     return {quantity: by_class[quantity][ALL] for quantity in by_class}
-
-
-def _find_fastest_mps(robot: str, data: Dataset) -> float | None:
-    """Return a robot's greatest speed [m/s], as the recipe of the dataset or else the package knows it."""
-    known = {**load_shipped_profiles().robots, **data.card.recipe.robots}
-    return known.get(robot, Robot()).max_velocity_mps
 
 
 def _compare_times(

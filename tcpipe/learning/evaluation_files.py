@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tcpipe import __version__
-from tcpipe.errors import Location, UsageError, clean_lines
-from tcpipe.formats.atomic import clear, write_text
+from tcpipe.errors import UsageError, clean_lines
+from tcpipe.formats.atomic import Location, clear, write_text
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.finding_lines import format_findings, list_verdict
 from tcpipe.formats.integrity import seal_document
@@ -102,7 +102,14 @@ def run_evaluation(
     """
     rules = config or EvaluateConfig()
     own = [] if predictor is None else [load_own_kind(predictor).digest]
-    key = _make_key(model, dataset, rules, own)
+    lines = [
+        seal_document(read_model_card(fetch_directory(model))),
+        compute_dataset_checksum(read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])),
+        asdict(rules),
+        __version__,
+        *own,
+    ]
+    key = digest(lines)
     if not is_url(out):
         _check_directory(Path(out))
     if (known := _read_known(out, key)) is not None:
@@ -134,15 +141,3 @@ def _read_known(out: Location, key: str) -> EvaluationResult | None:
     if values.get("key") != key:
         return None
     return EvaluationResult(found.place.where(), parse_typed(values, Evaluation, where))
-
-
-def _make_key(model: Location, dataset: Location, config: EvaluateConfig, own: list[str]) -> str:
-    """Return the hash that identifies an evaluation."""
-    lines = [
-        seal_document(read_model_card(fetch_directory(model))),
-        compute_dataset_checksum(read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])),
-        asdict(config),
-        __version__,
-        *own,
-    ]
-    return digest(lines)

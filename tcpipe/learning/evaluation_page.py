@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from tcpipe.arrays import Floats
 from tcpipe.cost.coverage import Coverage
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.learning.baselines import SPLITS
@@ -321,14 +320,10 @@ def draw_predictions(table: pa.Table, audit: str) -> PageSection:
     return PageSection("Measured against predicted", f"{text}\n{audit}", plots=plots)
 
 
-def _read_slope_deg(table: pa.Table) -> Floats:
-    return np.degrees(to_floats(table, "slope_rad"))
-
-
 def make_worst_section(table: pa.Table) -> PageSection:
     """Return the samples of each split with the largest errors of E, or of T without energy, largest first."""
     worst, quantity = table.take(pa.array(find_worst_rows(table, _WORST))), find_main_cost(table)
-    off, slope = compute_cost_errors(worst, quantity), _read_slope_deg(worst)
+    off, slope = compute_cost_errors(worst, quantity), np.degrees(to_floats(worst, "slope_rad"))
     label, std = (to_floats(worst, make_column_name(quantity, part)) for part in ("", "std"))
     texts = [to_texts(worst.column(name)) for name in ("split", "sample_id", "terrain_name")]
     rows = [

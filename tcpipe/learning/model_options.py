@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Literal
 
-from tcpipe.errors import Location
+from tcpipe.formats.atomic import Location
 from tcpipe.tables.options import MAP, MODEL, PREDICTOR, RECIPE, SEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from tcpipe.arrays import Floats, Floats32, Mask
 from tcpipe.cost.prediction_errors import QuantityErrors, estimate_correlation, fit_errors
 from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
-from tcpipe.errors import Location, ModelError, StoreError, UsageError
-from tcpipe.formats.atomic import write_text
+from tcpipe.errors import ModelError, StoreError, UsageError
+from tcpipe.formats.atomic import Location, write_text
 from tcpipe.formats.integrity import compute_checksums, read_sealed, seal_document, write_sealed
 from tcpipe.formats.json_files import digest, parse_typed
 from tcpipe.formats.parquet import read_table, write_table

@@ -79,12 +79,6 @@ def find_slope_and_class(features: Floats, channels: Sequence[str], class_count:
     return slope, class_id
 
 
-def _count_features(channels: Sequence[str], class_count: int) -> int:
-    """Return how many features the channels have together."""
-    last = list(_locate_features((*channels, ""), class_count))[-1]
-    return last[1]
-
-
 def _is_band(channel: str) -> bool:
     return "[" in channel
 
@@ -299,7 +293,8 @@ class BoostingModel(Predictor):
         texts: dict[str, ArrayForm] = {f"trees_{at}": ("uint8", (f"bytes_{at}",)) for at in range(len(inputs.outputs))}
         check_arrays(arrays, {**texts, **list_curve_arrays(len(inputs.outputs))})
         curves, _ = read_curves(arrays)
-        known = _count_features(inputs.planes, inputs.class_count) + len(inputs.extra_features)
+        last = list(_locate_features((*inputs.planes, ""), inputs.class_count))[-1]
+        known = last[1] + len(inputs.extra_features)
         trees = tuple(clean_trees(arrays[name].tobytes().decode(errors="replace"), known) for name in texts)
         return cls(TableModel(curves, trees, inputs.planes, inputs.class_count), inputs)
 

@@ -17,8 +17,8 @@ from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import name_common_std
 from tcpipe.dataset.extra_features import ExtraFeature, available_features, read_extra_features
 from tcpipe.dataset.tensor import ONE_HOT
-from tcpipe.errors import DatasetError, Location, ModelError, StoreError, UsageError
-from tcpipe.formats.atomic import clear_beside
+from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
+from tcpipe.formats.atomic import Location, clear_beside
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
@@ -163,7 +163,10 @@ def train(
             "--without-patches, or train your own model on its samples.parquet"
         )
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules)})
-    checkpoint = _name_checkpoint(out, key)
+    place = Path(str(out).rstrip("/").rpartition("/")[2]) if is_url(out) else Path(out)
+    clear_beside(place)
+    named = place if place.name not in {"", ".."} else place.resolve()
+    checkpoint = named.with_name(f"{named.name}.{key[:8]}.checkpoint")
     if no_resume:
         checkpoint.unlink(missing_ok=True)
     elif (known := _read_known_model(out, predictor)) is not None and known.training.key == key:
@@ -195,14 +198,6 @@ def train(
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
     return _make_result(out, "done", card.training, fitted.training_times_s)
-
-
-def _name_checkpoint(out: Location, key: str) -> Path:
-    """Return the file that keeps the state of a training."""
-    place = Path(str(out).rstrip("/").rpartition("/")[2]) if is_url(out) else Path(out)
-    clear_beside(place)
-    named = place if place.name not in {"", ".."} else place.resolve()
-    return named.with_name(f"{named.name}.{key[:8]}.checkpoint")
 
 
 def _report_layers(data: Dataset, channels: Sequence[str], *, is_chosen: bool) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.arrays import Ints
-from tcpipe.errors import FusionError, Location, UsageError, clean_lines
+from tcpipe.errors import FusionError, UsageError, clean_lines
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles

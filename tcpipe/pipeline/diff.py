@@ -13,7 +13,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints, Mask
-from tcpipe.errors import Location, clean_lines
+from tcpipe.errors import clean_lines
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, RecordChange, compare_records, format_value
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches, read_card, read_samples, sample_columns
 from tcpipe.formats.finding_lines import format_findings

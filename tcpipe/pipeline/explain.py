@@ -13,7 +13,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError, Location, StoreError, clean_lines
+from tcpipe.errors import DatasetError, StoreError, clean_lines
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.dataset_card import DatasetCard, MapSource
 from tcpipe.formats.dataset_files import (
     SAMPLES,
@@ -139,23 +140,23 @@ def explain(sample_id: str, *, dataset: Location = "dataset", store: Location = 
             f"{directory}: is without coordinates, so that its samples have no known source; explain the dataset with them"
         )
     sample = _read_sample(directory, sample_id)
-    return Explained(sample_id, _read_history(card, sample, _find_run(opened, directory, card, sample)))
-
-
-def _read_history(card: DatasetCard, sample: Row, run: StoredRun) -> History:
+    run = _find_run(opened, directory, card, sample)
     window, streams = (sample["start_ns"], sample["end_ns"]), read_streams(run.place, run.facts)
-    return History(
-        sample=sample,
-        quality=flag_names(sample["quality"], Quality),
-        run=run.facts,
-        messages={} if streams is None else dict(_find_messages(streams, *window)),
-        masks=tuple(_iterate_masks(run, *window)),
-        rejected=tuple(_iterate_rejections(run, *window)),
-        map=next((source for source in card.maps if source.name == sample["map"]), None),
-        recipe_differs_in={
-            key: item for key, item in flatten_recipe(card.recipe).items() if item != _DEFAULTS.get(key)
-        },
-        versions=Versions(card.tcpipe_version, __version__, card.data_model_version),
+    return Explained(
+        sample_id,
+        History(
+            sample=sample,
+            quality=flag_names(sample["quality"], Quality),
+            run=run.facts,
+            messages={} if streams is None else dict(_find_messages(streams, *window)),
+            masks=tuple(_iterate_masks(run, *window)),
+            rejected=tuple(_iterate_rejections(run, *window)),
+            map=next((source for source in card.maps if source.name == sample["map"]), None),
+            recipe_differs_in={
+                key: item for key, item in flatten_recipe(card.recipe).items() if item != _DEFAULTS.get(key)
+            },
+            versions=Versions(card.tcpipe_version, __version__, card.data_model_version),
+        ),
     )
 
 

@@ -13,8 +13,8 @@ from typing import Literal
 import pyarrow as pa
 
 from tcpipe import __version__
-from tcpipe.errors import Location, LogError, StoreError, UsageError
-from tcpipe.formats.atomic import clear
+from tcpipe.errors import LogError, StoreError, UsageError
+from tcpipe.formats.atomic import Location, clear
 from tcpipe.formats.json_files import read_as, write_json
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.logs.log_joining import AnyLog, open_single_log
@@ -108,7 +108,12 @@ def export(
     shown = format_path(log_path)
     with open_single_log(log_path, message_definitions=message_definitions) as log:
         wanted = _select_topics(log, shown, topics)
-        made_from = _make_origin(log, shown, message_definitions)
+        made_from = ExportOrigin(
+            log=shown if is_url(shown) else str(Path(shown).resolve()),
+            size_and_time=tuple((size, time_ns) for size, time_ns in log.size_and_time),
+            message_definitions=make_definitions_key(message_definitions),
+            tcpipe_version=__version__,
+        )
         paths = _make_paths(out, sorted(log.topics))
         index = _read_index(out)
         _refuse_others_files(index, made_from, {name: paths[name] for name in wanted})
@@ -144,15 +149,6 @@ def _select_topics(log: AnyLog, log_path: str, topics: Sequence[str]) -> list[st
     if topics and not split:
         raise LogError(f"{log_path}: no topic is named; there are: {there}")
     return split or sorted(log.topics)
-
-
-def _make_origin(log: AnyLog, log_path: str, message_definitions: Path | None) -> ExportOrigin:
-    return ExportOrigin(
-        log=log_path if is_url(log_path) else str(Path(log_path).resolve()),
-        size_and_time=tuple((size, time_ns) for size, time_ns in log.size_and_time),
-        message_definitions=make_definitions_key(message_definitions),
-        tcpipe_version=__version__,
-    )
 
 
 def _read_index(out: Path) -> ExportIndex | None:

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from tcpipe import __version__
-from tcpipe.errors import Location, LogError, StoreError, TcpipeError, UsageError, clean_line, list_first
+from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, clean_line, list_first
 from tcpipe.execution import refuse_import_of_script, run_all
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.atomic import Location, make_scratch_directory
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_presigned, make_absolute

@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from tcpipe.errors import Location, StoreError, TcpipeError, UsageError
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.errors import StoreError, TcpipeError, UsageError
+from tcpipe.formats.atomic import Location, make_scratch_directory
 from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.logs.log_file import list_logs_below
 from tcpipe.formats.logs.log_joining import open_single_log
@@ -121,7 +121,16 @@ def inspect(
     if is_url(path):
         return _inspect_url(str(path).rstrip("/"), ask)
     if not is_path(path):
-        return _inspect_run(find_named_runs(path, store))
+        runs = find_named_runs(path, store)
+        run, manifests = runs[0], [run.manifest for run in runs]
+        return InspectedRun(
+            path=run.place.where(),
+            run_id=run.run_id,
+            log=run.facts.log,
+            tags=run.facts.tags,
+            notes=manifests[0].notes,
+            recipes=tuple(convert_record(each, InspectedRecipe, verdict=each.verdict) for each in manifests),
+        )
     path = Path(path)
     if (path / "dataset.json").is_file():
         return _inspect_dataset(path, str(path))
@@ -193,18 +202,6 @@ def _try_inspect(path: Location, ask: Callable[[Location], InspectedLog]) -> Ins
         return ask(path)
     except TcpipeError as error:
         return InspectedLog(path=format_path(path), problems=error.problems)
-
-
-def _inspect_run(runs: Sequence[StoredRun]) -> InspectedRun:
-    run, manifests = runs[0], [run.manifest for run in runs]
-    return InspectedRun(
-        path=run.place.where(),
-        run_id=run.run_id,
-        log=run.facts.log,
-        tags=run.facts.tags,
-        notes=manifests[0].notes,
-        recipes=tuple(convert_record(each, InspectedRecipe, verdict=each.verdict) for each in manifests),
-    )
 
 
 def _inspect_store(store: Store) -> InspectedStore:

@@ -11,7 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from tcpipe.errors import Location, LogError, StoreError, clean_line
+from tcpipe.errors import LogError, StoreError, clean_line
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.log_file import find_logs, list_logs_below
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files

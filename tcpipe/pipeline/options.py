@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from tcpipe.errors import Location
+from tcpipe.formats.atomic import Location
 from tcpipe.tables.options import (
     DRY_RUN,
     MESSAGE_DEFINITIONS,

@@ -17,7 +17,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Ints
-from tcpipe.errors import Location, LogError, StoreError, UsageError, clean_lines
+from tcpipe.errors import LogError, StoreError, UsageError, clean_lines
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.formats.parquet import read_table

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Literal, TypeAlias, TypeVar, get_args
 
 from tcpipe import __version__
-from tcpipe.errors import Location, TcpipeError, clean_line, hide_secrets
+from tcpipe.errors import TcpipeError, clean_line, hide_secrets
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.recipe_toml import ingest_key

@@ -15,7 +15,8 @@ from typing import cast
 import numpy as np
 
 from tcpipe.arrays import Ints
-from tcpipe.errors import Location, TcpipeError, clean_lines
+from tcpipe.errors import TcpipeError, clean_lines
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.finding_lines import describe_power, format_findings, format_loss, list_verdict
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tcpipe.errors import Location, UsageError, list_first
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.errors import UsageError, list_first
+from tcpipe.formats.atomic import Location, make_scratch_directory
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.runs import Call, Problem, Run, RunFacts, find_problems, make_failure
 from tcpipe.pipeline.calls import ACKNOWLEDGE, BUILD, INGEST, close_call, list_open_calls, record_call

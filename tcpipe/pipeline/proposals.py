@@ -17,7 +17,8 @@ import numpy as np
 import pyarrow.compute as pc
 
 from tcpipe.arrays import Floats
-from tcpipe.errors import Location, LogError, TcpipeError, UsageError, clean_line
+from tcpipe.errors import LogError, TcpipeError, UsageError, clean_line
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.finding_lines import describe_finding, format_number
 from tcpipe.formats.logs.log_file import list_logs_below
 from tcpipe.formats.logs.log_joining import open_single_log

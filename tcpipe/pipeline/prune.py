@@ -11,8 +11,8 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 
-from tcpipe.errors import Location, StoreError, TcpipeError, UsageError, clean_lines
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
+from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, Location, is_abandoned
 from tcpipe.formats.dataset_files import CARD, parse_card
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.object_storage import make_absolute

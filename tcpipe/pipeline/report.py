@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError, Location, StoreError, UsageError
+from tcpipe.errors import DatasetError, StoreError, UsageError
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.dataset_files import CARD, read_card, read_intact_card
 from tcpipe.formats.documents import BLOBS, State
 from tcpipe.formats.finding_lines import group_findings

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import TypeAlias
 
-from tcpipe.errors import Location, UsageError, clean_lines
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.errors import UsageError, clean_lines
+from tcpipe.formats.atomic import Location, make_scratch_directory
 from tcpipe.formats.documents import State
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_finding, group_findings
 from tcpipe.formats.object_storage import format_path

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from tcpipe.errors import Location, StoreError, TcpipeError, UsageError, clean_lines
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, find_leftovers, is_abandoned
+from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, Location, find_leftovers, is_abandoned
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD, SAMPLES, find_foreign_files, parse_card
 from tcpipe.formats.documents import (

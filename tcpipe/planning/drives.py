@@ -14,8 +14,8 @@ from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
-from tcpipe.errors import Location, ModelError, UsageError, clean_lines
-from tcpipe.formats.atomic import clear
+from tcpipe.errors import ModelError, UsageError, clean_lines
+from tcpipe.formats.atomic import Location, clear
 from tcpipe.formats.dataset_card import list_shifts
 from tcpipe.formats.finding_lines import format_findings, list_verdict
 from tcpipe.formats.json_files import write_json

@@ -12,8 +12,8 @@ import numpy as np
 from tcpipe.arrays import Floats
 from tcpipe.cost.adaptation import MeasuredRun
 from tcpipe.cost.prediction_errors import COVERAGE
-from tcpipe.errors import Location, MapError, ModelError, StoreError, UsageError, clean_lines
-from tcpipe.formats.atomic import clear_beside
+from tcpipe.errors import MapError, ModelError, StoreError, UsageError, clean_lines
+from tcpipe.formats.atomic import Location, clear_beside
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature, read_line
 from tcpipe.formats.integrity import describe_broken

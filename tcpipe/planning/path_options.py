@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING
 
-from tcpipe.errors import Location
+from tcpipe.formats.atomic import Location
 from tcpipe.tables.options import MAP, MODEL, PREDICTOR, SPEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:

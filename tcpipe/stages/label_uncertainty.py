@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints
 from tcpipe.cost.labels import SensorError
 from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
 from tcpipe.motion.row_sections import find_runs, number_pieces
@@ -274,13 +274,8 @@ def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts)
             for section in (facts.fuse.stretches if facts.fuse else ())
             if section.clock_epoch == epoch and sensor in section.sensors
         ]
-        count += confirms & _touches(fused, start_ns, end_ns)
+        touched = np.zeros(len(start_ns), dtype=np.bool_)
+        for first_ns, last_ns in fused:
+            touched |= (start_ns <= last_ns) & (end_ns >= first_ns)
+        count += confirms & touched
     return count
-
-
-def _touches(spans: list[tuple[int, int]], start_ns: Ints, end_ns: Ints) -> Mask:
-    """Return the segments that touch any of the spans, shape (M,)."""
-    touched = np.zeros(len(start_ns), dtype=np.bool_)
-    for first_ns, last_ns in spans:
-        touched |= (start_ns <= last_ns) & (end_ns >= first_ns)
-    return touched

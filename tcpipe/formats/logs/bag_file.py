@@ -350,19 +350,15 @@ class BagPart(ChunkedPart[_Chunk]):
             raise DamageError("chunk-index-damaged")
         found, position = [], chunk.record.end
         for _ in counts:
-            connection, start, size = self._index_record(position)
+            record = self._record(position)
+            if record.opcode != OP_INDEX or record.data_bytes % _INDEX_ENTRY_BYTES:
+                raise DamageError("chunk-index-damaged")
+            connection, start, size = (record.number(b"conn"), record.data_offset, record.data_bytes)
             found.append((connection, self._bytes.peek(start, size)))
             position = start + size
         if {connection: len(entries) // _INDEX_ENTRY_BYTES for connection, entries in found} != counts:
             raise DamageError("chunk-index-damaged")
         return found
-
-    def _index_record(self, position: int) -> tuple[int, int, int]:
-        """Return the connection of an index record, and offset and size of its entries."""
-        record = self._record(position)
-        if record.opcode != OP_INDEX or record.data_bytes % _INDEX_ENTRY_BYTES:
-            raise DamageError("chunk-index-damaged")
-        return record.number(b"conn"), record.data_offset, record.data_bytes
 
     def find_plain_data(self, chunk: _Chunk) -> int | None:
         """Return where the records of a chunk begin that is not compressed."""

@@ -16,8 +16,8 @@ from typing import Self
 
 import pyarrow as pa
 
-from tcpipe.errors import Location, LogError
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.errors import LogError
+from tcpipe.formats.atomic import Location, make_scratch_directory
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs import bag_file, mcap_records, sqlite_file
 from tcpipe.formats.logs.arrow_columns import TopicTable

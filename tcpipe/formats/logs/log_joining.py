@@ -16,7 +16,8 @@ from typing import TypeAlias
 
 import pyarrow as pa
 
-from tcpipe.errors import Location, LogError
+from tcpipe.errors import LogError
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.logs.log_file import Log, OpenLog, find_autopilot, open_log
 from tcpipe.formats.logs.message_tables import TableLog

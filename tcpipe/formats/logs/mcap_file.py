@@ -421,7 +421,11 @@ class McapPart(ChunkedPart[Chunk]):
         records, _ = self._step_through(chunk, data)
         self._declare(chunk, data, records)
         if chunk.index is None:
-            self._tally_messages(data, find_message_offsets(data, records))
+            messages = find_message_offsets(data, records)
+            channels = gather_integers(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.int64)
+            for channel, rows in group_by_key(channels):
+                stamps = gather_integers(data, messages[rows] + RECORD_HEAD + 6, "i8")
+                self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
 
     def _declare(self, chunk: Chunk, data: memoryview, records: Ints) -> None:
         for offset in records.tolist():
@@ -473,12 +477,6 @@ class McapPart(ChunkedPart[Chunk]):
     def _tally(self, channel: int, count: int, start_ns: int, end_ns: int) -> None:
         known, first_ns, last_ns = self._tallies.get(channel, (0, start_ns, end_ns))
         self._tallies[channel] = known + count, min(start_ns, first_ns), max(end_ns, last_ns)
-
-    def _tally_messages(self, data: memoryview, messages: Ints) -> None:
-        channels = gather_integers(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.int64)
-        for channel, rows in group_by_key(channels):
-            stamps = gather_integers(data, messages[rows] + RECORD_HEAD + 6, "i8")
-            self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
 
     def note_lost(self, chunk: Chunk, error: DamageError) -> None:
         """Note the damage of a chunk that is lost as a whole, counted by the message index beside it."""

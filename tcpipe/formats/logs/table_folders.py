@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tcpipe.errors import Location
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.documents import parse_name
 from tcpipe.formats.logs.rosbag2 import METADATA
 from tcpipe.recipe import TableMapping

@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from tcpipe.errors import DatasetError, Location, StoreError, TcpipeError, UsageError, clean_lines, list_first
+from tcpipe.errors import DatasetError, StoreError, TcpipeError, UsageError, clean_lines, list_first
 from tcpipe.execution import refuse_import_of_script
-from tcpipe.formats.atomic import check_local_output, clear_beside
+from tcpipe.formats.atomic import Location, check_local_output, clear_beside
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,

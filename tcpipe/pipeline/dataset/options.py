@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.errors import DatasetError, Location, RecipeError, UsageError
+from tcpipe.errors import DatasetError, RecipeError, UsageError
+from tcpipe.formats.atomic import Location
 from tcpipe.formats.dataset_files import FileFormat
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.recipe_toml import resolve_recipe
