@@ -1,6 +1,6 @@
 """Electric power: the rails of a robot, their value at any time, their energy over any span, and how uncertain that is.
 
-One rule for all who ask (the track's columns, a label's energy, the power at its end): a sample of a source that averages is the mean
-over the interval that ends at its stamp; any other is joined to its neighbours by a straight line. Of several samples at one stamp the
-first counts.
+Everything that uses power (track columns, label energies, power at a segment's end) follows one rule: a sample of an
+averaging source is the mean over the interval that ends at its stamp; other samples are joined by straight lines. Of
+several samples at one stamp the first counts.
 """

@@ -1,8 +1,9 @@
-"""Errors of the power sensor that a log shows: the zero of a current at rest, a gain that changes, and a sign that is lost.
+"""Errors of the power sensor that a log shows: offset of a current at rest, change of gain, lost sign.
 
-A battery sags in proportion to the current: dU = -R dI over seconds, with R its resistance. That is known without any model of the robot or
-its ground, so that it judges the current: where R seems to change at once, the gain of the current did (by the inverse), and where the
-voltage rises with the current, the current flows back and its sign is lost. Nothing is corrected: what is found widens σ.
+A battery's voltage sags in proportion to the current: dU = -R dI over seconds, with resistance R. This needs no model
+of the robot or ground, so it verifies the current: if R seems to change at once, the current's gain changed (by the
+inverse); if the voltage rises with the current, the current flows back and its sign is lost. Nothing is corrected: the
+errors found inflate σ.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _FEWEST_BLOCKS = 6
 """On either side of a change."""
 _FEWEST_SAMPLES = 400
 _CLEAR, _SURE, _GRADUAL = 20.0, 5.0, 3.0
-"""Standard deviations that show the resistance itself, a change of it, and that it is not gradual (a battery warms up)."""
+"""Least [σ]: the resistance itself, its change, and proof that the change is not gradual (battery warms up)."""
 _FEWEST_BRAKED = 5
 _LIKELY = 8.0
 """Logarithm of a ratio of likelihoods: of three thousand segments one by chance."""
@@ -35,7 +36,7 @@ _SHORTEST_HALT_NS = 1_000_000_000
 
 
 def measure_rest_currents(rail: Rail, still_ns: Ints) -> Floats:
-    """Return the mean current of a rail in each halt of a second or more [A]; ``still_ns``, shape (S, 2), begin and end [ns]."""
+    """Return a rail's mean current in each halt of 1 s or more [A]; ``still_ns``: begin and end [ns], shape (S, 2)."""
     settled = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
     settled = settled[settled[:, 1] - settled[:, 0] >= _SHORTEST_HALT_NS]
     first, last = (np.searchsorted(rail.current.stamp_ns, at_ns) for at_ns in settled.T)
@@ -45,7 +46,7 @@ def measure_rest_currents(rail: Rail, still_ns: Ints) -> Floats:
 
 
 def summarize_rest(rest_amp: Floats) -> tuple[float, float]:
-    """Return a low and a high current at rest [A], of at least one halt: a fifth of the halts may be odd (held on a slope, or stuck)."""
+    """Return the 0.2 and 0.8 quantile of currents at rest [A]; up to a fifth of halts may be odd (slope, stuck)."""
     low, high = np.quantile(rest_amp, (0.2, 0.8)).tolist()
     return low, high
 
@@ -53,9 +54,10 @@ def summarize_rest(rest_amp: Floats) -> tuple[float, float]:
 def estimate_offset_std(rest_amp: Floats, rest_range_amp: tuple[float, float] | None, prior_amp: float) -> float:
     """Return the standard deviation of a rail's zero by its currents in halts, [A], no less than the prior.
 
-    Halts beyond what the hardware takes, by more than the prior, leave a range of offsets, all as likely. On a slope the drives may take
-    more, so that the low halts count. Where halts differ, the zero moved, and it is unknown which halt is right. Without a known range an
-    offset smaller than the current at rest cannot be seen: half of that current is its standard deviation.
+    If halts exceed the hardware's range by more than the prior, all offsets that explain them are equally likely. On a
+    slope the drives may draw more, so that the low halts count. If halts differ, the zero moved, and it is unknown
+    which halt is right. Without a known range an offset below the current at rest is unobservable: half of that current
+    is its standard deviation.
     """
     if not rest_amp.size:
         return prior_amp
@@ -73,7 +75,7 @@ def estimate_offset_std(rest_amp: Floats, rest_range_amp: tuple[float, float] | 
 
 @dataclass(frozen=True, slots=True)
 class Sag:
-    """Changes of voltage [V] and current [A] within seconds, shape (N,), and of the current's neighbours, whose noise is another."""
+    """Changes of voltage [V] and current [A] within seconds, (N,), and of the current's neighbours (other noise)."""
 
     stamp_ns: Ints
     volt: Floats
@@ -123,7 +125,7 @@ class GainChange:
 
 
 def find_gain_change(sag: Sag | None) -> GainChange | None:
-    """Return the clearest change of the gain, by the battery's resistance before and after; None where it is not sure, or gradual."""
+    """Return the clearest change of the gain, by the battery's resistance; None if it is unsure or gradual."""
     if sag is None:
         return None
     start_ns, by_volt, weight = _split_blocks(sag)
@@ -162,7 +164,7 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
 
 
 def _compare_halves(start_ns: Ints, by_volt: Floats, weight: Floats) -> GainChange | None:
-    """Return the gain of the second half of the blocks over the first; None where it is usual, or a half does not show the resistance."""
+    """Return the gain of the second half of the blocks over the first; None if usual, or R is unknown in a half."""
     middle = len(weight) // 2
     first_ohm, last_ohm = (_estimate_ohm(by_volt[half], weight[half]) for half in (slice(middle), slice(middle, None)))
     if first_ohm is None or last_ohm is None:
@@ -177,7 +179,7 @@ def estimate_resistance_ohm(sag: Sag | None) -> float | None:
 
 
 def _split_blocks(sag: Sag) -> tuple[Ints, Floats, Floats]:
-    """Return the start of each block [ns], and its sums of voltage times current and of the current's square, shape (B,).
+    """Return each block's start [ns], sum of voltage times current, and sum of squared current, shape (B,).
 
     Blocks start anew after a gap that is longer than a block.
     """
@@ -190,7 +192,7 @@ def _split_blocks(sag: Sag) -> tuple[Ints, Floats, Floats]:
 
 
 def _estimate_ohm(by_volt: Floats, by_amp: Floats) -> float | None:
-    """Return the resistance of the battery by blocks [ohm]; None unless the residuals of the blocks show a clear sag."""
+    """Return the resistance of the battery by blocks [ohm]; None unless the blocks' residuals show a clear sag."""
     total = float(by_amp.sum())
     if total <= 0.0:
         return None
@@ -200,9 +202,10 @@ def _estimate_ohm(by_volt: Floats, by_amp: Floats) -> float | None:
 
 
 def find_lost_signs(sag: Sag | None, start_ns: Ints, end_ns: Ints, rise: Floats) -> Mask:
-    """Return the segments whose current flows back, but has no sign, shape (M,); none unless several downhill ones surely show it.
+    """Return the segments whose current flows back without a sign, shape (M,); none unless several downhill do.
 
-    There voltage and current rise together: the likelihoods of both signs are compared. ``rise`` is the tangent of the slope along travel.
+    Voltage and current rise together there; the likelihoods of both signs are compared. ``rise``: tangent of the slope
+    along travel.
     """
     nothing = np.zeros(len(rise), dtype=np.bool_)
     if sag is None or not len(rise):

@@ -1,13 +1,15 @@
-"""Standard deviation of the energy of a span by sampling, noise and quantisation of its power record, estimated from the record.
+"""Standard deviation of a span's energy due to sampling, noise and quantisation of its power record.
 
-The energy of a span is a weighted sum of samples. Independent errors of samples add their variance times the sum of the squared weights.
-A process of variance s and covariance s exp(-d / tau) that is sampled every h seconds differs from the sum of its samples over a span by
-s h² (coth(h / 2 tau) - 2 tau / h) for each interval. Means over periods have no such error, but where an end of the span divides a period.
+The energy of a span is a weighted sum of samples. Independent errors of samples add their variance times the sum of the
+squared weights. For a process with covariance s exp(-d / tau) that is sampled every h seconds, the integral over a span
+differs from the sum of samples by the variance s h² (coth(h / 2 tau) - 2 tau / h) for each interval. Means over periods
+have this error only where an end of the span divides a period.
 
-`fit_signal_model` describes a signal as a sum of such processes and independent errors. The scatter of a stationary robot is the variance
-of the errors. Second differences at several spacings show the processes: one that changes over tau scatters more the wider the spacing,
-up to tau. They are zero for a level and a steady rise, which an integral of straight lines follows exactly. The model holds for the whole
-record; near a span the size of the processes is that of the second differences there.
+`fit_signal_model` describes a signal as a sum of such processes and independent errors. The scatter of a stationary
+robot is the variance of the errors. Second differences at several spacings determine the processes: a process of tau
+scatters more the wider the spacing, up to tau. Second differences are zero for a constant and for a steady rise, which
+an integral of straight lines follows exactly. The model is of the whole record; near a span the second differences
+there give the size of the processes.
 """
 
 from __future__ import annotations
@@ -29,8 +31,8 @@ _NS = 1e-9
 class EnergyNoise:
     """Variances of each span's energy by cause [J²], shape (M,), independent of each other; 0 without rails.
 
-    ``rate`` is of the current between its samples, or within the time over which it is smoothed, ``current`` of its noise and rounding,
-    ``voltage`` all of the voltage's.
+    ``rate``: of the current between its samples, or within the time over which it is smoothed; ``current``: of its
+    noise and rounding; ``voltage``: all of the voltage's.
     """
 
     rate: Floats
@@ -123,14 +125,14 @@ def _estimate_integral_variance(
 
 
 def _find_cells(at_s: Floats, edge_s: Floats) -> tuple[Ints, Floats]:
-    """Return the cell between edges, (N + 1,), in which each time lies, and the share of the cell before the time, shape (M,)."""
+    """Return the cell (edges: shape (N + 1,)) of each time, and the share of the cell before it, shape (M,)."""
     place = np.interp(at_s, edge_s, np.arange(len(edge_s)))
     cell = np.minimum(place.astype(np.int64), len(edge_s) - 2)
     return cell, place - cell
 
 
 def _sum_squared_shares(variance: Floats, edge_s: Floats, start_s: Floats, end_s: Floats) -> Floats:
-    """Return the sum of variances of cells, (N,), each times the square of the share of the cell that a span covers, shape (M,)."""
+    """Sum the variances of cells, (N,), times the squared share of each cell that a span covers, shape (M,)."""
     (first, begin), (last, end) = (_find_cells(at_s, edge_s) for at_s in (start_s, end_s))
     sums = np.add.reduceat(variance, np.column_stack((first, last)).ravel())[::2] - variance[first]
     divided = variance[first] * (1.0 - begin) ** 2 + variance[last] * end**2
@@ -138,7 +140,7 @@ def _sum_squared_shares(variance: Floats, edge_s: Floats, start_s: Floats, end_s
 
 
 def _estimate_rounding(signal: SampledSignal, start_ns: Ints, end_ns: Ints) -> Floats:
-    """Return the variance of a signal that stays on one level of its resolution, shape (M,): all its samples have one error."""
+    """Return the variance of a signal on one level of its resolution, shape (M,): all its samples have one error."""
     changes = np.append(0, np.cumsum(np.diff(signal.value) != 0))
     first, last = (changes[np.maximum(np.searchsorted(signal.stamp_ns, at) - 1, 0)] for at in (start_ns, end_ns))
     return np.asarray((estimate_resolution(signal) * (end_ns - start_ns) * _NS) ** 2 / 12.0 / (1 + last - first))
@@ -149,15 +151,16 @@ _TAU = np.array([0.1, 1.0 / 3.0, 1.0, 3.0, 9.0, 27.0, 1.5, 4.5, 13.5])
 _PROCESSES = np.vstack((np.eye(6, 9), 2.0 * np.eye(3, 9, 3) - np.eye(3, 9, 6)))
 """Covariances of unit variance by exponentials: six are rough, three smooth, 2 exp(-d / tau) - exp(-2 d / tau)."""
 _SLOPES = np.append(np.zeros(6), 2.0 / _TAU[3:6] ** 2)
-"""Variance of the slopes of the smooth processes. By Euler and Maclaurin they add h⁴ / 72 of it to the error of an integral."""
+"""Slope variance of the smooth processes [1/s²]; h⁴ / 72 of it adds to an integral's error (Euler-Maclaurin)."""
 _SPACINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """Spacings of second differences, in samples: about two an octave."""
 _FEWEST = 20
 """Fewest second differences at a spacing: their mean square is known to a third."""
 _LOCAL_NS, _PRIOR_SAMPLES, _MIN_SCALE = 2_000_000_000, 4.0, 0.05
-"""The size of the processes near a span: time before and after it [ns], weight of the record beside the samples there, smallest value."""
+"""Size of the processes near a span: time before and after it [ns], weight of the whole record in samples, smallest
+value."""
 _CALM_S, _CALM_SAMPLES = 1.5, 8
-"""Length of a calm section [s], and its fewest samples: shorter than a halt, longer than what vibration correlates over."""
+"""Length of a calm section [s] (shorter than a halt, longer than vibration correlates), and its fewest samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +171,8 @@ class SignalModel:
     ----------
     error_variance : independent error of each sample.
     variance, tau_s : of each exponential of the processes' covariance, shape (K,), with its correlation time [s].
-    curvature_variance, slope_variance : of the processes, in the mean of `compute_curvature`, and of the slopes of smooth ones, per s².
+    curvature_variance, slope_variance : mean of `compute_curvature` by the processes, and slopes of the smooth ones
+        [per s²].
     """
 
     error_variance: float
@@ -178,12 +182,12 @@ class SignalModel:
     slope_variance: float
 
     def compute_interval_variance(self, interval_s: Floats) -> Floats:
-        """Return the variance of the processes' integrals over intervals [s], shape (N,), less those by their samples."""
+        """Return the variance of the processes' integral less that by samples, for intervals [s], shape (N,)."""
         half = interval_s / (2.0 * self.tau_s[:, None])
         return np.maximum(interval_s**2 * (self.variance @ (1.0 / np.tanh(half) - 1.0 / half)), 0.0)
 
     def compute_divided_variance(self, period_s: Floats, share: Floats) -> Floats:
-        """Return the variance of the processes' integrals over a share of periods [s], shape (M,), less the share of their means."""
+        """Return the variance of integrals over a share of periods [s] less that share of their means, shape (M,)."""
         before, after = (part * period_s / self.tau_s[:, None] for part in (share, 1.0 - share))
         squares = (1.0 - share) ** 2 * (before + np.expm1(-before)) + share**2 * (after + np.expm1(-after))
         products = share * (1.0 - share) * np.expm1(-before) * np.expm1(-after)
@@ -193,8 +197,8 @@ class SignalModel:
 def fit_signal_model(signal: SampledSignal, steady: Mask, still: Mask, *, averaged: bool) -> SignalModel:
     """Return the model of a signal by its ``steady`` samples, shape (N,), or by all where these are too few.
 
-    ``still`` are the samples of a stationary robot, shape (N,), where all scatter is error. Of ``averaged`` signals a sample is the mean
-    since the one before it.
+    ``still``, shape (N,), marks samples of a stationary robot, where all scatter is error. A sample of an ``averaged``
+    signal is the mean since the one before it.
     """
     period_s, size = compute_median_period_s(signal), np.zeros(len(_PROCESSES))
     spacing, seen, weight = _compute_second_differences(signal, steady, period_s)
@@ -232,7 +236,7 @@ def estimate_local_scale(
 
 
 def compute_curvature(signal: SampledSignal) -> Floats:
-    """Return each inner sample's squared deviation from the line through its neighbours, as the variance of one sample, shape (N - 2,)."""
+    """Return inner samples' squared deviations from their neighbours' line, as one sample's variance, (N - 2,)."""
     t, x = signal.stamp_ns, signal.value
     right = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
     off_line = x[1:-1] - (1.0 - right) * x[:-2] - right * x[2:]
@@ -242,7 +246,7 @@ def compute_curvature(signal: SampledSignal) -> Floats:
 def _estimate_error_variance(signal: SampledSignal, still: Mask, period_s: float, *, averaged: bool) -> float | None:
     """Return the variance of a sample against its neighbours: the median of calm sections of a stationary robot.
 
-    If no section of the record is stationary throughout, it is that of the calmest twentieth of means, and unknown of samples.
+    If no section is stationary throughout, use the calmest twentieth of means; for samples the variance is unknown.
     """
     count = max(_CALM_SAMPLES, round(_CALM_S / period_s))
     stationary = still[:-2] & still[1:-1] & still[2:]
@@ -255,7 +259,7 @@ def _estimate_error_variance(signal: SampledSignal, still: Mask, period_s: float
 
 
 def _compute_second_differences(signal: SampledSignal, steady: Mask, period_s: float) -> Floats:
-    """Return spacings, the variance that second differences at each show for one sample, and the weight of each, shape (3, S)."""
+    """Return spacings, the variance of one sample by second differences at each, and their weights, shape (3, S)."""
     found, x, t = list[tuple[int, float, float]](), signal.value, signal.stamp_ns
     unsteady = np.append(0, np.cumsum(~steady))
     for m in (each for each in _SPACINGS if 2 * each < len(x)):
@@ -269,7 +273,7 @@ def _compute_second_differences(signal: SampledSignal, steady: Mask, period_s: f
 
 
 def _predict_second_differences(spacing: Floats, *, averaged: bool) -> Floats:
-    """Return what second differences show of each process of unit variance, as the variance of one sample, shape (J, S)."""
+    """Return the second differences of each process of unit variance, as the variance of one sample, shape (J, S)."""
     rate = 1.0 / _TAU[:, None]
     apart, twice, own = np.exp(-rate * spacing), np.exp(-2.0 * rate * spacing), np.ones_like(rate)
     if averaged:  # covariances of means over a period

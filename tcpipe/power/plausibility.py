@@ -1,4 +1,4 @@
-"""Rows of a power topic that are no measurement: missing or marked values, values far from their neighbours, and overflows.
+"""Rows of a power topic without a measurement: missing or marked values, outliers, and overflows.
 
 A meter may be read less often than its messages are sent: the neighbours of a value are the nearest different values.
 """
@@ -17,13 +17,14 @@ _FEWEST_VALUES, _MARKS, _MOST_REPEATS = 20, 2, 5
 _SHORTEST_DRIVE_S = 1.0
 """No robot starts and stops within this."""
 _JUMP, _ASYMMETRY, _FEWEST_JUMPS = 0.6, 0.02, 4
-"""An overflow: smallest step and largest difference of both ends, as fractions of the span, and smallest number of steps."""
+"""An overflow: smallest step and largest difference of both ends [fractions of the span], and fewest steps."""
 
 
 def find_missing_rows(voltage_volt: Floats, current_amp: Floats) -> Mask:
     """Return the rows without a possible voltage, or with only one of both, shape (N,).
 
-    If most rows have only one of both, and currents without a voltage change, two sensors of different rates share a table.
+    If most rows have only one of them, and currents without a voltage change, two sensors of different rates share a
+    table.
     """
     has_voltage, has_current = np.isfinite(voltage_volt), np.isfinite(current_amp)
     live = voltage_volt[has_voltage & (voltage_volt > 0.0)]
@@ -38,9 +39,9 @@ def find_missing_rows(voltage_volt: Floats, current_amp: Floats) -> Mask:
 def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     """Return the rows whose value is isolated, shape (N,), and whether such values are too many, or too many in a row.
 
-    One or two values in a row are isolated if they are far from the median of five, by the largest usual value, or by half of it where
-    other values are near their medians. An exact value that may mean "not measured" is isolated if it is farther from both neighbours than
-    usual steps, and not repeated much longer than other values.
+    One or two values in a row are isolated if their distance from the median of five exceeds the largest usual value,
+    or half of it where other values are near their medians. An exact value that may mean "not measured" is isolated if
+    it is farther from both neighbours than usual steps, and is not repeated much longer than other values.
     """
     rows, found = np.flatnonzero(np.isfinite(values)), np.zeros(len(values), np.bool_)
     new = np.diff(values[rows], prepend=np.nan) != 0.0
@@ -75,7 +76,7 @@ def _compute_usual(steps: Floats) -> float:
 
 
 def _compare_with_median(values: Floats, width: int, quantiles: tuple[float, ...]) -> tuple[Floats, list[Floats]]:
-    """Return deviations from the median of ``width`` values: absolute, and relative to it or, if larger, its quantiles over the run."""
+    """Return absolute deviations from the median of ``width`` values, and relative to the larger of it or quantiles."""
     middle = np.median(sliding_window_view(np.pad(values, width // 2, mode="edge"), width), axis=1)
     size, deviation = np.abs(middle), np.abs(values - middle)
     tops = np.quantile(size[size > 0.0], quantiles) if size.any() else np.ones(len(quantiles))
@@ -83,9 +84,9 @@ def _compare_with_median(values: Floats, width: int, quantiles: tuple[float, ...
 
 
 def undo_overflow(current_amp: Floats) -> tuple[Floats, float, bool]:
-    """Return currents [A] without the overflow of a signed register, its span [A], and whether usual steps are clearly smaller.
+    """Return currents [A] without overflow of a signed register, its span [A], and whether usual steps are smaller.
 
-    The span is 0 where nothing overflows. Values end at plus and minus half of it, and jump from one end to the other. A driver may scale
+    The span is 0 without overflow. Values end at ± half of it, and jump from one end to the other. A driver may scale
     or round after the overflow, so that the span need not be a power of two of the resolution.
     """
     rows = np.flatnonzero(np.isfinite(current_amp))

@@ -1,14 +1,16 @@
-"""Rails: one voltage and one current each, and what they are between their samples (paper, section III: power is V(t) I(t)).
+"""Rails: one voltage and one current each, and their values between samples (paper, section III: power V(t) I(t)).
 
-The one rule: a sample of a source that averages over its message period (clearpath_platform_msgs/Power, Jackal and Warthog Status) is the
-mean over the interval that *ends* at its stamp, so its value holds backwards from there; other samples are joined by straight lines.
+One rule: a sample of a source that averages over its message period (clearpath_platform_msgs/Power, Jackal and Warthog
+Status) is the mean over the interval that *ends* at its stamp, so its value applies backwards from there; other samples
+are joined by straight lines.
 
 Energy of the drive rails between any two times (paper, section III: E is the integral of V(t) I(t)).
 
-A rail's voltage and current may come at different times. Both are brought to the union of their stamps, where both are known; then
+A rail's voltage and current may have different stamps. Both are brought to the union of the stamps, where both are
+known; then
 
 - ``exact``: both are straight between samples and their product is integrated in closed form;
-- ``averaged``: each sample is the mean since the one before it (clearpath_platform_msgs/Power, Jackal and Warthog Status): steps;
+- ``averaged``: each sample is the mean since the one before it: steps;
 - ``right_endpoint``: the paper's sum V(t_i) I(t_i) Δt_i over the union's stamps, its first and last term prorated.
 
 Every rule is prorated at both ends of a span. Negative power (regeneration) counts as it is.
@@ -47,13 +49,13 @@ def is_power_only(voltage_volt: Floats) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Rail:
-    """One drive rail in one clock epoch: its samples, and both signals on the union of their stamps where both are known.
+    """Drive rail in one clock epoch: samples, and both signals on the union of their stamps where both are known.
 
     Attributes
     ----------
     voltage, current : samples as measured, [V] and [A], current positive when drawn.
     averaged : whether a sample is the mean since the one before it.
-    stamp_ns : [ns], shape (N,), union of both stamps from the later first to the earlier last; empty if they never overlap.
+    stamp_ns : [ns], shape (N,), union of both stamps from the later first to the earlier last; empty without overlap.
     voltage_volt, current_amp : [V], [A], shape (N,), at those stamps.
     """
 
@@ -90,7 +92,7 @@ def make_rail(name: str, voltage: SampledSignal, current: SampledSignal, *, aver
 
 
 def interpolate_value(signal: SampledSignal, at_ns: Ints, *, averaged: bool) -> Floats:
-    """Return a signal of at least one sample at each time, shape (M,), by the one rule; its ends are held beyond them."""
+    """Return a signal of one sample or more at each time, shape (M,), by the one rule; ends are held beyond them."""
     if averaged:
         ends_at = np.searchsorted(signal.stamp_ns, at_ns, side="left")
         return signal.value[np.minimum(ends_at, len(signal.value) - 1)]
@@ -98,7 +100,7 @@ def interpolate_value(signal: SampledSignal, at_ns: Ints, *, averaged: bool) -> 
 
 
 def interpolate_rail(each: Rail, at_ns: Ints) -> tuple[Floats, Floats]:
-    """Return voltage [V] and current [A] of a rail at each time, shape (M,), ends held; NaN if they are never both known."""
+    """Return a rail's voltage [V] and current [A] at each time, shape (M,), ends held; NaN if never both known."""
     if not len(each.stamp_ns):
         return np.full(len(at_ns), np.nan), np.full(len(at_ns), np.nan)
     volt, amp = (SampledSignal(each.stamp_ns, value) for value in (each.voltage_volt, each.current_amp))
@@ -106,7 +108,7 @@ def interpolate_rail(each: Rail, at_ns: Ints) -> tuple[Floats, Floats]:
 
 
 def compute_power_watt(rails: list[Rail], at_ns: Ints) -> Floats:
-    """Return the power of all rails at each time, [W], shape (M,), ends held; NaN without rails, or if a rail is never known."""
+    """Return the power of all rails [W] at each time, shape (M,), ends held; NaN without rails or for unknown ones."""
     total = np.full(len(at_ns), np.nan if not rails else 0.0)
     for each in rails:
         volt, amp = interpolate_rail(each, at_ns)
@@ -115,7 +117,7 @@ def compute_power_watt(rails: list[Rail], at_ns: Ints) -> Floats:
 
 
 def sum_power(rails: list[Rail]) -> SampledSignal | None:
-    """Return the power of all rails [W] at the first one's currents; None without rails, or if a rail is never known."""
+    """Return the power of all rails [W] at the first one's currents; None without rails, or if one is never known."""
     if not rails or not all(len(each.stamp_ns) for each in rails):
         return None
     stamp_ns = rails[0].current.stamp_ns
@@ -125,8 +127,8 @@ def sum_power(rails: list[Rail]) -> SampledSignal | None:
 def compute_power_at(rails: list[Rail], at_ns: Ints, *, max_gap_ns: int) -> tuple[Floats, Floats, Floats]:
     """Return mean voltage [V], summed current [A] and summed power [W] at each stamp, each of shape (M,).
 
-    NaN without rails, and where any rail's voltage or current has no sample on both sides within max(3 of its periods, ``max_gap_ns``).
-    Voltage and current are NaN, too, where only the power of a rail is known.
+    NaN without rails, and where any rail has no voltage or current on both sides within max(3 of its periods,
+    ``max_gap_ns``). Voltage and current are also NaN where only the power of a rail is known.
     """
     if not rails:
         return (np.full(at_ns.size, np.nan),) * 3
@@ -155,7 +157,7 @@ Rule = Literal["exact", "averaged", "right_endpoint"]
 
 
 def integrate_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
-    """Return the energy of all rails over each span [J], shape (M,); NaN without rails, or where a rail is unknown in part of it."""
+    """Return the energy of all rails over each span [J], shape (M,); NaN without rails, or if one is partly unknown."""
     total = np.full(len(start_ns), np.nan if not rails else 0.0)
     for each in rails:
         inside = np.zeros(len(start_ns), np.bool_)
@@ -166,9 +168,10 @@ def integrate_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: R
 
 
 def integrate_recorded_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
-    """Return the energy that the record holds for each span, [J], shape (M,): where a rail is not known it adds nothing.
+    """Return the recorded energy of each span [J], shape (M,): a rail adds nothing where it is not known.
 
-    Unlike a label's, this is bookkeeping: spans that tile a run add up to the run's energy. Parameters as in `integrate_energy`.
+    Unlike a label's energy, this is bookkeeping: energies of consecutive spans add up to the run's. Parameters:
+    `integrate_energy`.
     """
     total = np.zeros(len(start_ns))
     for each in rails:
@@ -179,7 +182,7 @@ def integrate_recorded_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *
 
 
 def count_samples_inside(rails: list[Rail], start_ns: Ints, end_ns: Ints) -> tuple[Ints, Floats]:
-    """Return the number of current samples in (start, end], the fewest of any rail, and the plain mean power of the samples there [W].
+    """Return the fewest current samples of any rail in (start, end], and the plain mean power of the samples there [W].
 
     Both have shape (M,); 0 and NaN without rails, the mean NaN also where a rail has no sample.
     """
@@ -207,15 +210,17 @@ FEWEST_ROWS = 40
 """Fewest rows of a stationary robot."""
 _QUARTERS = 4
 _UNSEEN_SHARE = 0.1
-"""Share of the power by which one stationary second may differ from the rest of the run. The pack of FoMo's robot,
-which stands once for seconds, gives 12 % of that more while driving than the drives take (docs/explanation/real-data.md)."""
+"""Share of the power by which one stationary second may differ from the rest of the run. The battery pack of FoMo's
+robot, stationary only once, for seconds, gives 12 % of that power more than the drives take while driving
+(docs/explanation/real-data.md)."""
 
 
 @dataclass(frozen=True, slots=True)
 class IdlePower:
-    """Idle power of a run: the median of the means of seconds [W], and its standard deviation for any second of the run; NaN if unknown.
+    """Idle power of a run: median of the means of seconds [W], and its σ for any second of the run; NaN if unknown.
 
-    ``highest_watt``: highest median of a halt, from a second after its start, when motors no longer brake, plus three steps of the record.
+    ``highest_watt``: highest median of a halt from 1 s after its start, when motors no longer brake, plus three steps
+    of the record.
     """
 
     watt: float
@@ -224,12 +229,12 @@ class IdlePower:
 
 
 def estimate_idle_power(power_watt: Floats, halt: Ints, *, window_rows: int, step_watt: float) -> IdlePower:
-    """Return the idle power. A second is about as long as a segment takes, and its mean is finer than the record's step.
+    """Return the idle power, by means of seconds: as long as a segment takes, and finer than the record's step.
 
     Parameters
     ----------
     power_watt : [W], shape (N,), while the robot is stationary, in order of time; NaN where unknown.
-    halt : shape (N,), number of the row's halt, increasing; negative at the edges of a halt, where motors still or already draw.
+    halt : shape (N,), number of the row's halt, increasing; negative at the edges of a halt, where motors may draw.
     window_rows : rows of a second.
     step_watt : [W], resolution of power; a record that stays on one level has an error of up to half of it.
     """
@@ -252,13 +257,13 @@ def estimate_idle_power(power_watt: Floats, halt: Ints, *, window_rows: int, ste
 
 
 def _split_halts(halts: list[Floats], rows: int) -> list[Floats]:
-    """Return halts in parts of so many rows or somewhat more; those of less than half are left out where there are others."""
+    """Return halts in parts of ``rows`` rows or slightly more, without parts of less than half unless all are."""
     parts = [part for each in halts for part in np.array_split(each, max(each.size // rows, 1))]
     return [part for part in parts if 2 * part.size >= rows] or parts
 
 
 def _estimate_noise_variance(seconds: list[Floats]) -> float:
-    """Return the variance [W²] that noise gives the mean of a second: estimated from the means of its quarters, however rows correlate."""
+    """Return the variance of a second's mean due to noise [W²], by the means of its quarters (rows correlate)."""
     found = [
         float(np.var([quarter.mean() for quarter in np.array_split(each, _QUARTERS)], ddof=1)) / _QUARTERS
         for each in seconds

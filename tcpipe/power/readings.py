@@ -1,4 +1,4 @@
-"""From the messages of one or several power topics to rails that can be believed, with every current positive when drawn."""
+"""Rails from the messages of power topics: verified, with every current positive when drawn."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _list_rails(rails: Rails) -> list[tuple[str, RailReadings]]:
 
 @dataclass(frozen=True, slots=True)
 class Sides:
-    """Currents of both sides of the drive [A], positive when drawn, shape (N,), and the log times of their rows [ns]."""
+    """Currents of both sides of the drive [A], positive when drawn, shape (N,), and log times of their rows [ns]."""
 
     log_time_ns: Floats
     first_amp: Floats
@@ -68,7 +68,7 @@ class Sides:
 
 @dataclass(frozen=True, slots=True)
 class PowerReadings:
-    """Power topics: ``rails`` have a row for each message; without rails ``findings`` state why the power is rejected."""
+    """Power topics: ``rails`` have one row a message; without rails ``findings`` give the reason of rejection."""
 
     rails: Rails = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
@@ -97,8 +97,8 @@ def read_power(
 ) -> PowerReadings:
     """Return the rails of all power topics, with every current positive when drawn.
 
-    ``topics`` are message type and columns by topic, ``known`` the tables of message types, ``platform`` is the robot's; the others are
-    recipe keys.
+    ``topics``: message type and columns by topic; ``known``: tables of message types; ``platform``: the robot's; the
+    rest are recipe keys.
     """
     rails: dict[str, list[RailReadings]] = {}
     sources: list[PowerSource] = []
@@ -185,7 +185,7 @@ def _compare_charges(topics: Mapping[str, tuple[str, Columns]], rails: Rails) ->
 
 
 def _read_charge(columns: Columns) -> Floats | None:
-    """Return the charge of a battery message [Ah], shape (N,): its own, else its state of charge times its capacity; None without both."""
+    """Return a battery's charge [Ah], shape (N,): measured, else state of charge times capacity; None without both."""
     names = ("charge", "percentage", "capacity", "design_capacity")
     values = {name: np.asarray(columns[name], np.float64) for name in names if name in columns}
     measured = {name: value for name, value in values.items() if (value > 0.0).any()}  # 0 and NaN: not measured
@@ -209,7 +209,7 @@ def compare_second_meters(
     *,
     platform: str | None = None,
 ) -> PowerReadings:
-    """Return the power with the slope of the second meter that contradicts it most; ``meters`` are power topics that are not used."""
+    """Return the power with the slope of the most contradictory second meter; ``meters``: power topics not used."""
     series = [_sum_watt(topics[topic][1], rails) for topic, rails in power.rails.items()]
     if power.facts is None or not meters:
         return power
@@ -330,7 +330,7 @@ def _find_joints(joints: JointPower) -> Finding:
 def _convert_thousandths(
     topic: str, columns: Columns, sources: Sequence[PowerSource], known: Sequence[PowerSource]
 ) -> list[PowerSource]:
-    """Return the sources in millivolts or milliamperes, as far as their numbers are power then; none where they are not."""
+    """Return the sources in mV or mA whose numbers give possible power then; none if they do not."""
     for volt, amp in ((1.0, 1e-3), (1e-3, 1.0), (1e-3, 1e-3)):
         scaled = [
             replace(source, voltage_scale=volt * source.voltage_scale, current_scale=amp * source.current_scale)
@@ -357,7 +357,7 @@ def _propose_sources(sources: Mapping[str, Sequence[PowerSource]]) -> tuple[Reme
 
 
 def _unwrap_currents(rail: RailReadings) -> tuple[RailReadings, list[Finding]]:
-    """Return a rail with negative currents that were read as unsigned made negative again, and findings on that and its counter."""
+    """Return a rail with wrapped negative currents restored, and findings on them and on its energy counter."""
     names = {"rail": rail.name}
     if rail.counter is not None:
         resets = int(rail.counter.resets.max(initial=0))
@@ -384,7 +384,7 @@ def _pair_rails(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailRead
 
 
 def _find_incomplete(rails: Rails) -> list[Finding]:
-    """Return why rails, each of the topics that hold its parts, are no power: one without voltage, or without current."""
+    """Return the topics whose rails give no power, because they lack a voltage or a current."""
     parts: dict[str, list[tuple[str, RailReadings]]] = {}
     for topic, rail in _list_rails(rails):
         parts.setdefault(rail.name, []).append((topic, rail))
@@ -424,10 +424,10 @@ def _find_too_few(topic: str, log_time_ns: Floats) -> list[Finding]:
 
 
 def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[str, list[RailReadings]], list[Finding]]:
-    """Return the rails with NaN in all rows that are no measurement, and findings: on their number, or that the power is rejected.
+    """Return the rails with NaN in rows without a measurement, and findings: their number, or rejection of the power.
 
-    A row is one measurement: where its voltage or its current is missing or implausible, both are excluded. A driver sends such rows before
-    the sensor starts and after it stops; these are not counted.
+    A row is one measurement: if its voltage or current is missing or implausible, both are excluded. Rows that a driver
+    sends before the sensor starts and after it stops are not counted.
     """
     kept: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
     findings = []
@@ -454,7 +454,7 @@ def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[s
 def _undo_overflows(
     rails: dict[str, list[RailReadings]], log_times: Mapping[str, Floats]
 ) -> tuple[dict[str, list[RailReadings]], list[Finding]]:
-    """Return the rails without overflows of signed currents, and findings; power is rejected where the voltage does not confirm them."""
+    """Return rails without overflow of signed currents, and findings; reject power if the voltage contradicts them."""
     whole: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
     findings, are_clear = [], True
     for topic, rail in _list_rails(rails):
@@ -488,7 +488,7 @@ def _correlate_voltage(rails: Rails, log_times: Mapping[str, Floats]) -> float:
 def _sign(
     rails: Rails, log_times: Mapping[str, Floats], sources: list[PowerSource], given: CurrentSign
 ) -> tuple[int, tuple[Finding, ...], str]:
-    """Return the sign that makes a drawn current positive (0 where the record contradicts its type), findings, and its source."""
+    """Return the sign of a drawn current (0 if the record contradicts its type), findings, and the sign's source."""
     if given != "auto":
         return (1 if given == "drawn_positive" else -1), (), f"{given} (recipe)"
     time_s, whole = _sum_currents(rails, log_times)
@@ -505,7 +505,7 @@ def _sign(
 
 
 def _sign_by_charge(sign: int, net: float, sources: Sequence[PowerSource]) -> tuple[int, tuple[Finding, ...], str]:
-    """Return what `_sign` does where the types leave the sign open: where charge flows both ways, the convention of ROS, or no power."""
+    """Return the result of `_sign` if types define no sign: if charge flows both ways, ROS's convention or no power."""
     if sign < 0:
         return -1, (), "drawn_negative (mean, as ROS has it)"
     if sign > 0:
@@ -516,7 +516,7 @@ def _sign_by_charge(sign: int, net: float, sources: Sequence[PowerSource]) -> tu
 
 
 def _find_sign(code: str, names: Mapping[str, str], net: float, *signs: str) -> Finding:
-    """Return a finding on the sign of a drawn current: a note where nearly all charge flows one way, so that one sign is suggested."""
+    """Return a finding on the sign of a drawn current: a note if nearly all charge flows one way (suggested sign)."""
     severity: Severity | None = "note" if len(signs) == 1 else None
     remedies = [remedy for sign in signs for remedy in suggest(sign, {"read": {"current_sign": sign}})]
     return make_finding(code, _POWER, severity=severity, names=names, remedies=remedies, net_fraction=abs(net))
@@ -532,7 +532,7 @@ def _weight_s(time_s: Floats) -> Floats:
 
 
 def _sum_currents(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Floats, Floats]:
-    """Return the sum of all rails' currents [A] at the log times of the first topic that carries one, and these times [s]."""
+    """Return the sum of all rails' currents [A] at the log times of the first topic with a current, and these [s]."""
     parts = [
         (log_times[topic][known] / 1e9, rail.current_amp[known])
         for topic, rail in _list_rails(rails)

@@ -1,16 +1,16 @@
-"""How a power source samples: whether its messages repeat slower readings, a value is a mean over its period, or the record is smoothed.
+"""Sampling of a power source: repeated readings, means over the message period, and smoothing of the record.
 
-A driver may publish one reading several times: a battery monitor that is read once a second, in messages at 20 Hz. Messages repeat
-readings where values change only every so many messages, at almost constant intervals (a reading that equals the one before makes an
-interval of twice the length), and often by more than one level. A true signal that is coarsely quantised changes at irregular times;
-where it does so regularly (a ramp, an oscillation), it passes from level to level.
+A driver may publish one reading several times: a battery monitor that is read once a second, in messages at 20 Hz.
+Messages repeat readings if values change only every few messages, at almost constant intervals (an equal next reading
+doubles an interval), and often by more than one level. A true signal that is coarsely quantised changes at irregular
+times; where it changes regularly (a ramp, an oscillation), it passes from level to level.
 
-The motion shows whether a source averages: a mean lags the motion by half a period. A clock that is off by half a period looks the same,
-and has the same effect: values that are held backwards from their stamps are right then.
+The motion shows whether a source averages: a mean is half a period later than the motion. A clock offset of half a
+period looks the same and has the same effect: values that apply backwards from their stamps are right in both cases.
 
-A battery monitor may pass on a running mean over seconds, or a low-pass filter's output: power then follows the motion of all that time.
-Where the power of a run wanders like a random walk, a mean over a seconds before and b seconds after the stamp errs by the variance
-(a³ + b³) / (2 (a + b)³) times the mean squared change of the smoothed record over a + b seconds.
+A battery monitor may publish a running mean over seconds, or a low-pass filter's output: power then follows the motion
+of all that time. If the power of a run is a random walk, the variance of a mean over a seconds before and b seconds
+after the stamp is (a³ + b³) / (2 (a + b)³) times the mean squared change of the smoothed record over a + b seconds.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ _JUMPING_SHARE = 0.1
 def find_readings(stamp_ns: Ints, values: Floats) -> Ints | None:
     """Return the rows on which new readings arrived, shape (R,); None where messages do not surely repeat readings.
 
-    A reading that equals the one before it shows no change: its row is the one at which it is expected. ``stamp_ns`` [ns], shape (N,), does
-    not decrease; ``values``, shape (N, K), are quantities that are read together, finite.
+    A reading equal to the one before it shows no change: its row is where it is expected. ``stamp_ns`` [ns], shape
+    (N,), does not decrease; ``values``, shape (N, K), finite, are quantities that are read together.
     """
     changed = np.flatnonzero((values[1:] != values[:-1]).any(axis=1)) + 1
     if changed.size <= _FEWEST_INTERVALS or not _has_jumps(values[changed]):
@@ -62,7 +62,7 @@ def _has_jumps(values: Floats) -> bool:
 
 
 def _find_reading_period(interval: Floats) -> float | None:
-    """Return how many messages a reading lasts, by the intervals between changes [messages]; None where they are not regular."""
+    """Return how many messages a reading lasts, by intervals between changes; None if they are not regular."""
     period = float(interval[interval <= 1.5 * np.quantile(interval, 0.2)].mean())
     for _ in range(3):
         count = np.maximum(np.rint(interval / period), 1.0)
@@ -80,9 +80,10 @@ def _find_reading_period(interval: Floats) -> float | None:
 
 
 def _find_arrivals(at_ns: Floats, changed: Ints, *, period_ns: float, message_ns: float) -> Ints:
-    """Return the rows that change, and those at which equal readings are expected: evenly between changes, and beyond the outer ones.
+    """Return rows that change or where equal readings are expected: evenly between changes and beyond the outer ones.
 
-    Where messages are missing for a reading's period, the age of the first message after them is not known: it is no arrival.
+    If messages are missing for a reading's period, the age of the first message after them is unknown: it is no
+    arrival.
     """
     resumed = np.flatnonzero(np.diff(at_ns) > period_ns) + 1
     found = [changed[:0]]
@@ -112,10 +113,11 @@ _CLEARLY = 0.9
 def is_stated_averaged(
     power_ns: Ints, power_watt: Floats, motion_ns: Ints, forward_mps: Floats, yaw_rate_radps: Floats
 ) -> bool | None:
-    """Return whether each value is the mean since the one before it (True) or sampled (False); None where motion shows neither.
+    """Return whether values are means since the one before (True) or samples (False); None if motion shows neither.
 
-    Power is fitted by a constant, speed, its square, turning and the gain of speed, as means over one period about a time that is a delay
-    before each stamp. The delay that fits best decides, unless it is neither's, or hardly better than the other.
+    Power is fitted by a constant, speed, its square, turning and the gain of speed, as means over one period about a
+    delay before each stamp. The delay that fits best decides, unless it fits neither case, or hardly better than the
+    other.
 
     Parameters
     ----------
@@ -158,8 +160,8 @@ class PowerFit:
     Attributes
     ----------
     at_s, power_watt : times of the samples (the middle of a stated mean) and values, shape (N,).
-    motion_s, sums : times of the motion, shape (M,), and integrals of the causes of power from the first time, shape (M, 5): a constant,
-        speed, turning, the gain of kinetic energy, and one more.
+    motion_s, sums : times of the motion, shape (M,), and integrals of the causes of power from the first time, shape
+        (M, 5): constant, speed, turning, gain of kinetic energy, and one more.
     stated_s : width of the means that the source states; 0 for instantaneous values.
     """
 
@@ -170,11 +172,11 @@ class PowerFit:
     stated_s: float
 
     def compute_squared_residuals(self, smoothing: Smoothing) -> Floats:
-        """Return the squared residuals [W²], shape (N,), of power that is smoothed and delayed so; zero width is a delay alone."""
+        """Return the squared residuals [W²], shape (N,), of power smoothed and delayed so; width 0: a delay only."""
         return self.fit_means(smoothing.late_s, max(self.stated_s + smoothing.width_s, _INSTANT_S))
 
     def fit_means(self, late_s: float, width_s: float) -> Floats:
-        """Return the squared residuals [W²], shape (N,), of power by means of its causes over a width, about a delay before each stamp."""
+        """Return squared residuals [W²], shape (N,), of power by its causes' means over a width, with a delay."""
         later, earlier = (
             np.column_stack([np.interp(self.at_s - late_s + half_s, self.motion_s, each) for each in self.sums.T])
             for half_s in (width_s / 2.0, -width_s / 2.0)
@@ -191,8 +193,8 @@ def make_power_fit(
 
     Parameters
     ----------
-    motion_ns, motion : rising stamps [ns], shape (M,), with forward velocity, yaw rate and one more cause of power, as the rate of climb,
-        shape (M, 3).
+    motion_ns, motion : rising stamps [ns], shape (M,), and forward velocity, yaw rate and one more cause of power (rate
+        of climb), shape (M, 3).
     averaged : whether a value is stated to be the mean since the one before it.
     margin_s : motion that must be known before and after a sample [s].
     """
@@ -242,8 +244,8 @@ def _find_minimum(squares: Floats) -> float:
 def find_smoothing(fit: PowerFit, *, corrected_s: float = 0.0) -> Smoothing | None:
     """Return over how long power [W] is smoothed, by the motion that it follows; None where that is not sure.
 
-    A mean must explain more than a delay alone, and clearly more than means about the stamp, which fit better where the motion is noisy.
-    ``corrected_s`` is what the recipe adds to the stamps [s]: a mean ends at the stamp before that.
+    A mean must explain more than a delay alone, and clearly more than means about the stamp, which fit better if the
+    motion is noisy. ``corrected_s`` is the recipe's correction of the stamps [s]: a mean ends at the uncorrected stamp.
     """
     after_s = max(-corrected_s, 0.0)
     longest_s = float(fit.at_s[-1] - fit.at_s[0]) / _FEWEST_MEANS
@@ -261,7 +263,7 @@ def find_smoothing(fit: PowerFit, *, corrected_s: float = 0.0) -> Smoothing | No
 
 
 def estimate_smoothing_variance(power: SampledSignal, steady: Mask, smoothing: Smoothing) -> float:
-    """Return the variance of power [W²] that smoothing hides, by how smoothed power [W] changes while ``steady``, shape (N,)."""
+    """Return the variance of power [W²] that smoothing hides, by changes of smoothed power [W]; ``steady``: (N,)."""
     at_s = (power.stamp_ns - power.stamp_ns[0]) / 1e9
     earlier_s = at_s - smoothing.width_s
     change = power.value - np.interp(earlier_s, at_s, power.value)
@@ -279,11 +281,11 @@ _USUAL_DELAY_S = 0.03
 def estimate_delay_variance(
     rails: list[Rail], start_ns: Ints, end_ns: Ints, delay_s: float, std_s: float, *, rule: Rule
 ) -> Floats:
-    """Return the mean square of what a delay of power changes of each span's energy [J²], shape (M,); 0 where it is unknown.
+    """Return the mean squared change of each span's energy by a delay of power [J²], shape (M,); 0 if unknown.
 
-    The energies of two spans in a row change by opposite amounts at their border: over a path the error averages out. The mean is over
-    the normal distribution of the delay (``delay_s``, ``std_s`` [s]), by Gauss and Hermite's three nodes. A delay inside 2σ is weighted
-    with the usual delay of a synchronised driver.
+    The energies of two consecutive spans change by opposite amounts at their border: over a path the error averages
+    out. The mean is over the normal distribution of the delay (``delay_s``, ``std_s`` [s]), by three nodes of
+    Gauss-Hermite quadrature. A delay inside 2σ is weighted with the usual delay of a synchronised driver.
     """
     if abs(delay_s) < 2.0 * std_s:
         weight = _USUAL_DELAY_S**2 / (_USUAL_DELAY_S**2 + std_s**2)

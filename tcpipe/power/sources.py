@@ -1,13 +1,14 @@
 """Voltages and currents of a power topic's messages, by the tables of its type; and reasons to reject them.
 
-A *rail* is one voltage and the currents drawn at it; a robot's propulsion power is the sum over its rails. The supply of computers and user
-ports is not part of it if the message measures it separately (paper, section IV-A: "current consumed by the motors for propulsion").
+A *rail* is one voltage and the currents drawn at it; a robot's propulsion power is the sum over its rails. It excludes
+the supply of computers and user ports if the message measures it separately (paper, section IV-A: "current consumed by
+the motors for propulsion").
 
-Power of joints (sensor_msgs/JointState): each draws p = torque * speed + r * torque². Where the torque is the motor current's (times the
-torque constant, at the shaft whose speed is measured) and r the motor's resistance over the squared constant, that is the motor's
-electrical power, with what gears and bearings take; not of a torque measured behind the gear. Electronics, and the idle power of drives,
-never are part of it. A joint that brakes gives back -p where p is negative; unless the source states that this is recovered, it counts as
-0: a brake resistor or the drive takes it.
+Power of joints (sensor_msgs/JointState): each draws p = torque * speed + r * torque². If the torque is the motor
+current's (times the torque constant, at the shaft whose speed is measured) and r the motor's resistance over the
+squared constant, p is the motor's electrical power, including losses of gears and bearings. A torque measured behind
+the gear excludes them. Electronics and the idle power of drives are never included. A braking joint gives back -p where
+p is negative; unless the source states that this is recovered, it counts as 0: a brake resistor or the drive takes it.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class JointMotion:
 
 
 def select_joints(columns: Columns, source: PowerSource) -> JointMotion:
-    """Return the joints of a source, which messages may hold in any order; ``columns`` are those of messages that have all three fields."""
+    """Return a source's joints, in any order in messages; ``columns``: of messages that have all three fields."""
     layouts = _find_layouts(columns[NAMES])
     joints = sorted({name for layout in layouts for name in layout if name and re.fullmatch(source.joints, name)})
     values = np.full((2, len(columns[NAMES]), len(joints)), np.nan)
@@ -67,7 +68,7 @@ def _find_layouts(names: NDArray[np.str_]) -> dict[tuple[str, ...], Ints]:
 
 @dataclass(frozen=True, slots=True)
 class JointPower:
-    """Power that joints draw [W], shape (N,), and the shares of its sum that are the loss, and that are given back but do not count."""
+    """Power that joints draw [W], shape (N,), and shares of its sum: loss, and energy given back but not counted."""
 
     names: tuple[str, ...]
     watt: Floats
@@ -88,7 +89,7 @@ def compute_joint_power(motion: JointMotion, source: PowerSource, *, sign: int) 
 
 
 def reject_power(topic: str, reason: str, *, names: Mapping[str, str] | None = None, **numbers: Any) -> Finding:
-    """Return the finding that a topic's power is not used, for a reason in kebab case; names and numbers are the evidence."""
+    """Return the finding that a topic's power is not used; ``reason`` in kebab case; names and numbers are evidence."""
     return make_finding(REJECTED, Subject("topic", topic), names={"reason": reason, **(names or {})}, **numbers)
 
 
@@ -96,8 +97,8 @@ def reject_power(topic: str, reason: str, *, names: Mapping[str, str] | None = N
 class RailReadings:
     """A rail's readings, NaN where a row carries none: voltage [V] and current [A], shape (N,).
 
-    Of a counter of energy the current is a first one, by times that are not verified yet. In ``unmeasured_count`` rows one of the summed
-    currents stood still or was clipped: there the current is NaN.
+    For an energy counter the current is preliminary, by times that are not verified yet. In ``unmeasured_count`` rows
+    one of the summed currents was frozen or clipped: there the current is NaN.
     """
 
     name: str
@@ -123,9 +124,9 @@ FLOAT_TYPES = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
 def find_sources(
     type_name: str, topic: str, known: Sequence[PowerSource], *, platform: str | None, husky_power: HuskyPower
 ) -> list[list[PowerSource]] | Finding:
-    """Return what a topic's messages hold of power, one source a rail, then what to fall back on; or why it is not known.
+    """Return the power sources of a topic's messages, one a rail, then alternatives; or the reason why none is known.
 
-    Of the tables of its type that fit, the most particular count: those of ``husky_power``, of the platform, of the topic.
+    Of the tables of its type that fit, the most specific counts: of ``husky_power``, of the platform, of the topic.
     """
     of_type = [source for source in known if source.type == type_name]
     fitting = [
@@ -150,7 +151,7 @@ def find_sources(
 
 
 def list_power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[str]:
-    """Return the columns inside lists of messages that a type's tables name, as drivers[].current, and the names of joints."""
+    """Return the columns inside lists of messages that a type's tables name (drivers[].current), and joint names."""
     mine = [source for source in known if source.type == type_name]
     texts = [text for source in mine for text in (source.voltage, source.current, source.power, source.energy)]
     numbers = {field.column for text in texts for field in parse_fields(text) if "[]." in field.column}
@@ -310,11 +311,11 @@ _FROZEN_NS, _FEWEST_EQUAL = 5_000_000_000, 20
 _MOVES = 0.5
 """Share of the range of 90 % of a current: a current that changes by more is driven."""
 _BESIDE, _CROWDED = 20, 10.0
-"""Levels next to the end of a range, and how many times as many values as on one of them are at the end of a clipped current."""
+"""Levels next to the end of a range, and least count at the end of a clipped current over that of such a level."""
 
 
 def find_unmeasured(parts: Floats, stamp_ns: Ints, *, wraps_amp: float | None = None) -> Mask:
-    """Return the rows in which one of several currents, shape (N, K), is clipped, or repeats a value while another changes, shape (N,)."""
+    """Return rows in which one of the currents, shape (N, K), is clipped, or repeats as another changes, (N,)."""
     found = np.zeros(len(parts), np.bool_)
     parts = np.where(np.abs(parts) <= _IMPOSSIBLE, parts, np.nan)
     for column, values in enumerate(parts.T):
@@ -339,7 +340,7 @@ def _is_clipped(values: Floats) -> Mask:
 
 
 def _is_frozen(values: Floats, others: Floats, stamp_ns: Ints) -> Mask:
-    """Return where a current repeats one value for seconds while one of the others, shape (N, K), changes as in driving."""
+    """Return rows in which a current repeats for seconds while one of the others, shape (N, K), changes (driving)."""
     frozen = np.zeros(len(values), np.bool_)
     first = np.flatnonzero(np.concatenate(([True], values[1:] != values[:-1])))
     last = np.append(first[1:], len(values)) - 1
@@ -358,11 +359,12 @@ _OFF_GRID = 0.02
 
 
 def find_wrap(current_amp: Floats) -> float | None:
-    """Return what is to be subtracted from the upper values of a current [A], shape (N,), NaN where unknown; None where it never wrapped.
+    """Return the wrap to subtract from upper values of a current [A], shape (N,), NaN if unknown; None without wraps.
 
-    A Warthog's motor controllers send a signed number of 1/16 A as unsigned (norlab-ulaval/warthog_sevcon_fix), AgileX's did with 0.1 A
-    until 2024 (agilexrobotics/ugv_sdk, 7769abf): -2 A reads as 4094 A, or as 6551.6 A. So it is where all values are on the grid of a
-    number of 16 bits, some in its upper quarter, and none in the two quarters between, which no current crosses without a value there.
+    A Warthog's motor controllers send a signed number of 1/16 A as unsigned (norlab-ulaval/warthog_sevcon_fix),
+    AgileX's sent 0.1 A so until 2024 (agilexrobotics/ugv_sdk, 7769abf): -2 A reads as 4094 A, or as 6551.6 A. A current
+    wraps if all values are on the grid of a number of 16 bits, some in its upper quarter, and none in the two middle
+    quarters, which no current crosses without a value there.
     """
     known = current_amp[np.isfinite(current_amp)]
     if known.size < _FEWEST_EQUAL or known.min() < 0.0:
@@ -464,10 +466,10 @@ _UNAMBIGUOUS = read_threshold(REJECTED, "min_net_fraction")  # of the charge mov
 
 
 def sign_by_mean(current_amp: Floats, weight_s: Floats) -> tuple[int, float]:
-    """Return the sign that makes the robot draw power over the run (0 where that is unclear), and ∫I dt / ∫|I| dt, in [-1, 1].
+    """Return the sign that makes the robot draw power over the run (0: unclear), and ∫I dt / ∫|I| dt, in [-1, 1].
 
-    A driving robot draws more than it feeds back, so the mean of its whole current shows the sign. ``current_amp`` [A], shape (N,), is the
-    sum of all rails as recorded; ``weight_s`` [s] the time of each row.
+    A driving robot draws more than it feeds back, so its mean current shows the sign. ``current_amp`` [A], shape (N,):
+    sum of all rails as recorded; ``weight_s`` [s]: time of each row.
     """
     whole = float(np.nansum(np.abs(current_amp) * weight_s))
     ratio = float(np.nansum(current_amp * weight_s)) / whole if whole > 0 else 0.0
@@ -482,7 +484,7 @@ def apply_sign(rail: RailReadings, sign: int) -> RailReadings:
 
 @dataclass(frozen=True, slots=True)
 class Counter:
-    """A counter row by row: energy since the first row [J], shape (N,), NaN where a row has none, and how often it was reset before."""
+    """Counter by row: energy since the first row [J], shape (N,), NaN if a row has none, and earlier resets."""
 
     energy_joule: Floats
     resets: Ints
@@ -494,8 +496,8 @@ class Counter:
     def mean_amp(self, stamp_ns: Ints, voltage_volt: Floats) -> Floats:
         """Return the mean current since the row before [A], at the row's voltage [V], shape (N,); stamps in [ns].
 
-        So voltage times current, held backwards from each stamp as of any source that averages, is what was counted. NaN on the first row,
-        after a reset, and where time stands still.
+        Voltage times current, applied backwards from each stamp as for averaging sources, then equals the counted
+        energy. NaN on the first row, after a reset, and where the stamp does not advance.
         """
         amp = np.full(len(stamp_ns), np.nan)
         row = np.flatnonzero(np.isfinite(self.energy_joule) & (voltage_volt > 0.0))
@@ -507,10 +509,10 @@ class Counter:
 
 
 def count_energy(parts: Sequence[tuple[float, Floats]], *, wraps: float | None) -> Counter:
-    """Return what counters that only rise counted together.
+    """Return the summed energy of counters that only rise.
 
-    ``parts`` are the energy of each counter's unit [J], negative where it is subtracted, and its readings, shape (N,). It begins at zero
-    again at ``wraps``, in its own unit; a fall that no wrap explains is a reset.
+    ``parts``: energy of each counter's unit [J], negative if subtracted, and its values, shape (N,). A counter restarts
+    from zero at ``wraps``, in its own unit; a fall that no wrap explains is a reset.
     """
     energy = np.zeros(len(parts[0][1]))
     resets = np.zeros(len(energy), np.int64)

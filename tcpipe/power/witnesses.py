@@ -1,9 +1,10 @@
 """Witnesses of electric power: measurements that do not use the current sensor and show whether its scale is possible.
 
-A factor of 10 or 100 is one line of a driver, and no statistics of the power itself can show it. Each witness is coarse, but independent:
+A factor of 10 or 100 is one line of a driver, and no statistics of the power can show it. Each witness is coarse, but
+independent:
 
 - *slopes*: climbing costs m g sin(slope) v over an efficiency, which is known within a factor of three;
-- *weight*: a metre of level ground costs a fraction of the robot's weight that is bounded by rolling resistance and efficiency;
+- *weight*: energy per metre of level ground is a fraction of the weight, bounded by rolling resistance and efficiency;
 - *charge*: the battery's charge or state of charge falls by the integral of the current;
 - *second meter*: a meter of the whole pack follows the power of the drives with slope 1;
 - *sides*: in straight driving both sides of a skid-steered robot draw power.
@@ -53,7 +54,7 @@ class Climb(NamedTuple):
     reliability: float
 
     def is_certain(self) -> bool:
-        """Return whether the slopes are more than noise, and the factor can confirm or contradict the scale of power."""
+        """Return whether the slopes exceed noise, and the factor can confirm or contradict the scale of power."""
         least, most = (
             read_threshold(IMPLAUSIBLE, name) for name in ("min_slope_reliability", "max_climb_std_fraction")
         )
@@ -69,13 +70,14 @@ def estimate_climb(
     piece: Ints,
     mass_kg: float,
 ) -> Climb | None:
-    """Fit power = a + b v + factor · m g sin(slope) v + c |yaw rate| to segments; None for fewer than 20, or on level ground.
+    """Fit power = a + b v + factor · m g sin(slope) v + c |yaw rate|; None for under 20 segments, or level ground.
 
-    The slope of the segments two before and two behind is the instrument of each slope, so that noise of heights does not bias it.
+    The slopes of the segments two before and two behind are the instruments, so that noise of heights adds no bias.
 
     Parameters
     ----------
-    power_watt, velocity_mps, mean_abs_yaw_rate_radps : of each segment, in the order of driving, [W], [m/s], [rad/s], shape (M,).
+    power_watt, velocity_mps, mean_abs_yaw_rate_radps : of each segment, in driving order, [W], [m/s], [rad/s], shape
+        (M,).
     rise : tangent of the slope along travel, shape (M,).
     piece : number of the uninterrupted section that each segment is in, shape (M,).
     mass_kg : mass of the robot [kg].
@@ -107,7 +109,7 @@ def _average_neighbours(values: Floats, piece: Ints) -> Floats:
 
 
 def _fit_with_instruments(columns: Floats, instruments: Floats, target: Floats, *, column: int) -> tuple[float, float]:
-    """Return one coefficient of a robust two-stage least-squares fit and its σ; columns and instruments have shape (M, K)."""
+    """Return a coefficient of a robust two-stage least-squares fit and its σ; columns, instruments: shape (M, K)."""
     size = np.maximum(np.abs(columns).max(axis=0), 1e-12)
     columns, instruments = columns / size, instruments / size
     fitted = instruments @ np.linalg.lstsq(instruments, columns, rcond=None)[0]
@@ -129,16 +131,16 @@ def _fit_with_instruments(columns: Floats, instruments: Floats, target: Floats, 
 def compute_weight_ratio(net_energy_jpm: Floats, rise: Floats, mass_kg: float) -> float | None:
     """Return the median net energy per metre of level ground over the weight [1]; None for fewer than 20 such segments.
 
-    ``net_energy_jpm`` is the energy above idle power [J/m], ``rise`` the tangent of the slope, shape (M,); ``mass_kg`` [kg].
+    ``net_energy_jpm``: energy above idle power [J/m]; ``rise``: tangent of the slope, shape (M,); ``mass_kg`` [kg].
     """
     level = net_energy_jpm[np.isfinite(net_energy_jpm) & (np.abs(rise) < _LEVEL_RISE)]
     return float(np.median(level)) / (mass_kg * _GRAVITY_MPS2) if len(level) >= _MIN_SEGMENTS else None
 
 
 def compare_charge(time_s: Floats, current_amp: Floats, charge_ah: Floats) -> float | None:
-    """Return the integral of the current over the fall of the charge [1]; None if the charge falls by less than 5 % of its first value.
+    """Return the current's integral over the fall of the charge [1]; None if the charge falls by less than 5 %.
 
-    ``time_s`` [s], ``current_amp`` [A] (positive when drawn) and ``charge_ah`` [Ah] have shape (N,); NaN is not measured.
+    ``time_s`` [s], ``current_amp`` [A] (positive when drawn), ``charge_ah`` [Ah]: shape (N,); NaN is not measured.
     """
     known = np.isfinite(charge_ah) & (charge_ah > 0.0)
     drawn = np.isfinite(current_amp)
@@ -153,7 +155,7 @@ def compare_charge(time_s: Floats, current_amp: Floats, charge_ah: Floats) -> fl
 
 
 def compare_meters(drive_watt: Floats, pack_watt: Floats) -> tuple[float, float] | None:
-    """Return the slope of the pack's power over the power of the drives, shape (N,), and their correlation; None for few rows.
+    """Return the slope of the pack's power over the drives', shape (N,), and their correlation; None for few rows.
 
     A constant load of the pack (computers) does not change the slope.
     """
@@ -170,7 +172,7 @@ _MAX_HALF_SHARE = 0.36
 
 
 def estimate_missing_std_fraction(side_share: float | None) -> float:
-    """Return σ of the gain for what one side may lack: half a side cannot be detected, because sound robots have shares of 0.13 to 0.50."""
+    """Return σ of the gain for an unmeasured part of a side; sound robots have side shares of 0.13 to 0.50."""
     share = 0.5 if side_share is None else min(side_share, 1.0 - side_share)
     return (1.0 - 2.0 * share) / 3.0**0.5 if share < _MAX_HALF_SHARE else 0.0
 
@@ -178,7 +180,7 @@ def estimate_missing_std_fraction(side_share: float | None) -> float:
 def compute_side_share(first_amp: Floats, second_amp: Floats, is_straight: Mask) -> float | None:
     """Return the share of the first of two sides in their current in straight driving [1]; None for fewer than 30 rows.
 
-    The currents [A], shape (N,), are positive when drawn. A share below 0.05 or above 0.95 shows that one whole side is not measured.
+    The currents [A], shape (N,), are positive when drawn. Below 0.05 or above 0.95 one whole side is not measured.
     """
     used = is_straight & np.isfinite(first_amp + second_amp)
     total = float((first_amp + second_amp)[used].sum())
@@ -193,8 +195,8 @@ RESISTANCE_OHM = "battery_ohm"
 def compare_batteries(runs: Iterable[tuple[str, str, Iterable[Finding]]]) -> Iterator[Finding]:
     """Yield each run whose battery has another resistance than the other runs of its robot.
 
-    ``runs`` are run, robot and findings of each. The voltage sags in proportion to the current, so that a run with another scale of its
-    current shows another resistance.
+    ``runs``: run, robot and findings of each. The voltage sags in proportion to the current, so that another scale of a
+    run's current shows as another resistance.
     """
     by_robot: dict[str, dict[str, float]] = {}
     for run_id, robot, findings in runs:
@@ -204,7 +206,7 @@ def compare_batteries(runs: Iterable[tuple[str, str, Iterable[Finding]]]) -> Ite
     most, most_of_batteries = (read_threshold(_BATTERY, name) for name in ("max_ratio", "max_ratio_of_batteries"))
     for robot, by_run in by_robot.items():
         for run_id, ohm in by_run.items():
-            # Of two runs each is compared with the other; of three or more a single odd one does not make the others odd.
+            # Two runs are compared with each other; of three or more, a single odd run does not make the others odd.
             compared = [other for other_id, other in by_run.items() if other_id != run_id or len(by_run) != 2]
             ratio = ohm / float(np.median(compared))
             excess = max(ratio, 1.0 / ratio)

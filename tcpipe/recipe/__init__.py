@@ -1,10 +1,11 @@
-"""The recipe: every key that rules the pipeline, one frozen dataclass a stage, with its default, its bounds and its reason.
+"""The recipe: every key of the pipeline's configuration, one frozen dataclass a stage, with default, bounds and reason.
 
-It is checked when it is made, in TOML and in Python alike. ``formats.recipe_toml`` reads it from TOML; docs/reference/recipe.md and
-``tcpipe init`` are written from the docstrings here.
+It is checked at creation, in TOML and in Python. ``formats.recipe_toml`` reads it from TOML; docs/reference/recipe.md
+and ``tcpipe init`` are written from the docstrings here.
 Names end in their units. Rulings and their sources: docs/explanation/rulings.md.
 
-A bound is where a value can mean nothing any more, or costs without end: it is far outside of what any robot, sensor or site asks for.
+Outside its bounds a value has no meaning or unlimited cost: bounds are far outside the needs of any robot, sensor or
+site.
 """
 
 from __future__ import annotations
@@ -72,15 +73,15 @@ class ReadConfig(_Section):
     """Topics by role, and the meaning of their numbers and stamps."""
 
     topics: dict[Role, list[str]] = field(default_factory=dict)
-    """Topics by role (gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, power, command, pose), where types are ambiguous."""
+    """Topics by role (gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, power, command, pose), if unclear."""
     ignore_topics: list[str] = field(default_factory=list)
     """Topics that are never used."""
     fields: dict[MappedRole, dict[str, str]] = field(default_factory=dict, metadata=LEFT_OUT)
-    """Fields of your own message types by role, as gnss.latitude = "pvt.lat * 1e-7"; also name the topic under topics."""
+    """Fields of your own message types by role (gnss.latitude = "pvt.lat * 1e-7"); also list the topic in topics."""
     pose_crs: str | None = field(default=None, metadata=LEFT_OUT)
-    """Projected CRS of the pose's positions, as EPSG:2949; without one they stay in a local frame and cannot be placed on a map."""
+    """Projected CRS of the pose's positions (EPSG:2949); default: a local frame, which cannot be placed on a map."""
     pose_sources: list[MadeFrom] = field(default_factory=list, metadata=LEFT_OUT)
-    """Roles that the pose was computed from (besides GNSS): they are not fused as well, because they would count twice."""
+    """Roles besides GNSS that the pose was computed from: not fused as well, because they would count twice."""
     namespace: str | None = None
     """For a log of several robots: use only topics below this name (for example "/husky_1"); default: all topics."""
     extrinsics: dict[Role, Extrinsics] = field(default_factory=dict)
@@ -88,7 +89,7 @@ class ReadConfig(_Section):
     gnss_crs: str = "EPSG:4326"
     """Geographic CRS of the GNSS positions; RTK often comes in a national datum."""
     fix_std_m: dict[FixQuality, Deviation] = field(default_factory=dict, metadata=LEFT_OUT)
-    """Horizontal σ of fixes without or with constant covariance [m]: rtk_fixed 0.02, rtk_float 0.5, differential 1, single 4."""
+    """Horizontal σ of fixes without useful covariance [m]: rtk_fixed 0.02, rtk_float 0.5, differential 1, single 4."""
     time_source: dict[Role, Literal["auto", "header", "log"]] = field(default_factory=dict)
     """Source of stamps by role: header, log or auto; auto uses header.stamp if it is set and follows the log time."""
     time_offset_s: dict[Role, Offset] = field(default_factory=dict)
@@ -96,17 +97,17 @@ class ReadConfig(_Section):
     odometry_scale: dict[Role, Scale] = field(default_factory=dict, metadata=LEFT_OUT)
     """Factor on velocities and distances of an odometry (wheels of another radius, a camera of another baseline)."""
     imu_units: Literal["si", "deg", "g", "deg_g"] = "si"
-    """Units of the IMU: si is rad/s and m/s² as in REP-103; deg is deg/s and m/s²; g is rad/s and g; deg_g is deg/s and g."""
+    """Units of the IMU: si: rad/s and m/s² (REP-103); deg: deg/s and m/s²; g: rad/s and g; deg_g: deg/s and g."""
     current_scale: Annotated[float, Bounds(ge=1e-6, le=1e6)] = field(default=1.0, metadata={"json": (1.0,)})
     """Factor on all currents, powers and counters of energy: 0.001 if a driver publishes milliamperes as amperes."""
     current_sign: Literal["auto", "drawn_positive", "drawn_negative"] = "auto"
-    """Sign of currents: auto uses that of the message type; for BatteryState, which differs by robot, the mean over the run decides."""
+    """Sign of currents: auto uses the message type's; for BatteryState, which differs by robot, the run's mean."""
     current_offset_amp: Annotated[float, Bounds(ge=-1e4, le=1e4)] = field(default=0.0, metadata={"json": (0.0,)})
     """Zero of each rail's current, positive as drawn, that is subtracted [A]; of a power without voltage [W]."""
     power_averaged: Literal["auto", "yes", "no"] = "auto"
     """Whether the power source averages over its message period: auto uses the value of the message type."""
     husky_power: Literal["battery", "drivers"] = "battery"
-    """Power of a Husky: battery is battery voltage times both driver currents (as in the paper), drivers uses each driver's voltage."""
+    """Power of a Husky: battery voltage times both driver currents (paper), or drivers: each driver's own voltage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,17 +123,17 @@ class FuseConfig(_Section):
     gnss_std_floor_m: Deviation = 0.01
     """Lower bound of GNSS standard deviations, whatever the receiver reports [m]."""
     gnss_default_std_m: Deviation = 0.05
-    """Horizontal standard deviation where the receiver gives none (the paper's RTK: 5 cm); vertical is twice as large [m]."""
+    """Horizontal σ where the receiver gives none (the paper's RTK: 5 cm); vertical is twice as large [m]."""
     lever_arm_std_m: tuple[Tolerance, Tolerance, Tolerance] | None = field(default=None, metadata=LEFT_OUT)
-    """Standard deviation of the stated lever arm of the GNSS antenna or pose [m]; 0: exact. Default: forward and left 0.05, up 0.1."""
+    """Standard deviation of the lever arm of GNSS antenna or pose [m]; 0: exact. Default: 0.05 horizontal, up 0.1."""
     gnss_velocity_std_mps: Deviation = field(default=0.1, metadata={"json": (0.1,)})
-    """Standard deviation of a receiver's own velocity where it gives none (NMEA never does) [m/s]; vertical is twice as large."""
+    """σ of a receiver's own velocity if it gives none (NMEA never does) [m/s]; vertical is twice as large."""
     wheel_std_mps: Deviation = 0.05
     """Standard deviation of wheel velocity where the source gives none [m/s]."""
     visual_std_mps: Deviation = 0.05
     """Standard deviation of visual velocity where the source gives none [m/s]."""
     nonholonomic_std_mps: Deviation = 0.15
-    """Sideways and vertical velocity are zero to within this, sixty times a second; much smaller values cause GNSS to be rejected [m/s]."""
+    """σ of zero sideways and vertical velocity, 60 times a second [m/s]; far smaller values lead to rejected GNSS."""
     gyro_noise_radps: Deviation = 0.003
     """White noise of the gyroscope at its rate [rad/s]."""
     accelerometer_noise_mps2: Deviation = 0.10
@@ -140,7 +141,7 @@ class FuseConfig(_Section):
     max_gap_s: Gap = 1.0
     """Without any motion measurement for this long the track has a gap [s]."""
     max_power_gap_s: Gap = 0.3
-    """A power gap longer than this, and than three periods, leaves the track without power there and ends a segment [s]."""
+    """A power gap longer than this and three periods removes the track's power there and ends a segment [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,13 +207,13 @@ class MaskConfig(_Section):
     command_settle_s: Widening = 2.0
     """Rows this long after a commanded change are masked [s]."""
     require_full_speed: bool = True
-    """With commands: mask rows commanded below `full_speed_fraction` of the robot's maximum, where the terrain does not limit the speed."""
+    """With commands: mask rows commanded below `full_speed_fraction` of maximum speed, where terrain is no limit."""
     full_speed_fraction: Fraction = 0.95
     """See `require_full_speed`."""
     max_velocity_mps: Limit | None = None
     """Maximum speed of the robot; default: from the profile [m/s]."""
     max_plausible_mps: PlausibleSpeed | None = field(default=None, metadata=LEFT_OUT)
-    """No labels where the track is faster than this; the run fails if most of a minute is. Default: from the profile [m/s]."""
+    """No labels where the track is faster; the run fails if most of a minute is. Default: from the profile [m/s]."""
     stationary_velocity_mps: Limit = 0.05
     """Slower than this (and not turning) is stationary [m/s]."""
     stationary_yaw_rate_radps: Limit = 0.05
@@ -276,7 +277,7 @@ class SampleConfig(_Section):
     max_position_std_m: Deviation = 0.10
     """Largest standard deviation of the absolute position of a sample [m]."""
     align: bool = False
-    """Whether each run is moved by the shift at which its heights fit the map's ground; its σ counts in max_position_std_m."""
+    """Whether each run is shifted so that its heights fit the map's ground; its σ counts in max_position_std_m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,7 +285,7 @@ class SplitConfig(_Section):
     """How samples are split into train and test."""
 
     holdout: Literal["block", "sample", "run", "tag"] = "block"
-    """Unit held out for test: block (spatial), sample (random, as in the paper), run, or tag (runs with the same value of a tag)."""
+    """Unit held out for test: block (spatial), sample (random, as in the paper), run, or tag (runs by tag value)."""
     holdout_tag: str = ""
     """With the holdout tag: which tag, for example season."""
     test_fraction: Annotated[float, Bounds(ge=0, lt=1)] = 0.2
@@ -294,19 +295,19 @@ class SplitConfig(_Section):
     buffer_m: Annotated[float, Bounds(ge=0, le=1e6)] | None = None
     """A footprint nearer than this to the border of a region is in no split; default: sqrt(2) times the chord [m]."""
     folds: Annotated[int, Bounds(ge=2, le=100)] = 5
-    """Number of folds for cross-validation on train and test; a fold has whole blocks, or whole runs (or tags) with that holdout."""
+    """Cross-validation folds of train and test; a fold has whole blocks, or whole runs (or tags) with that holdout."""
     seed: Annotated[int, Bounds(ge=0, le=2**32 - 1)] = 0
     """Seed of the split and of the row order."""
 
 
 @dataclass(frozen=True, slots=True)
 class CovariateConfig(_Section):
-    """How tables of weather, soil or snow are joined to the samples by time (`tcpipe build-dataset --covariates FILE`)."""
+    """How tables of weather, soil or snow are joined to samples by time (`tcpipe build-dataset --covariates FILE`)."""
 
     time_column: str | None = None
-    """Column of the stamps; default: the only one named time, stamp, timestamp, date or datetime, with or without a unit."""
+    """Column of stamps; default: the only one named time, stamp, timestamp, date or datetime, a unit may follow."""
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
-    """Unit of stamps that are numbers, since 1970: auto uses the ending of the name, or the unit that gives dates of this century."""
+    """Unit of numeric stamps since 1970: auto uses the name's ending, or the unit that gives dates of this century."""
     max_age_s: Annotated[float, Bounds(ge=1e-3, le=1e9)] = 7200.0
     """Each sample uses the last row before its start; largest age of this row [s]."""
 
@@ -367,9 +368,9 @@ class TableMapping:
     role: Role | None = None
     """Role of the table; default: its name. Power may have several tables."""
     columns: dict[str, str] = field(default_factory=dict)
-    """Column by field (latitude, linear_x, voltage, …: docs/how-to/tables.md), or an expression, as "(velL + velR) / 2"."""
+    """Column by field (latitude, linear_x, …: docs/how-to/tables.md), or an expression, as "(velL + velR) / 2"."""
     units: dict[str, str] = field(default_factory=dict)
-    """Units by field: "rad", "km/h", "g", "mV", …; default: that of the column's name, else deg, m, m/s, rad/s, m/s2, V, A, W, J."""
+    """Units by field: "km/h", "mV", …; default: from the column's name, else deg, m, m/s, rad/s, m/s2, V, A, W, J."""
     nominal_voltage_volt: Volt | None = field(default=None, metadata=LEFT_OUT)
     """Assumed voltage of a current [V]."""
     nominal_voltage_std_fraction: Share = field(
@@ -379,20 +380,20 @@ class TableMapping:
     stamp: str | None = None
     """Column of the stamps; default: the first."""
     stamp_unit: Literal["auto", "s", "ms", "us", "ns", "ms_today"] = "auto"
-    """Unit of numeric stamps; auto infers it from their size if they count from 1970, else from the name. ms_today counts from midnight."""
+    """Unit of numeric stamps; auto infers it from their size (from 1970) or name. ms_today counts from midnight."""
     stamp_format: str = field(default="", metadata={"json": ("",)})
     """Format of stamps that are text, as "%d.%m.%Y %H:%M:%S%.f"; "": one of the usual."""
     stamp_zone: str = field(default="", metadata={"json": ("",)})
     """Time zone of stamps without one, as "Europe/Vienna" or "UTC"; also of the tables that state none."""
     stamp_date: str = field(default="", metadata={"json": ("",)})
-    """Date of times of day: a column, or as "2025-07-09"; "": that of the file's name, else of its last change, with a note."""
+    """Date of times of day: a column, or as "2025-07-09"; "": of the file's name, else its last change, with a note."""
     stamp_utc: str = field(default="", metadata={"json": ("",)})
     """Column of UTC, also in whole seconds: the stamps of a faster clock are shifted onto it by one constant."""
     offset_s: Offset = 0.0
     """Added to the stamps [s]."""
 
     def make_power_source(self, name: str) -> PowerSource | None:
-        """Return what a table of this name holds of power, where that is neither a voltage nor a current as it stands."""
+        """Return the power source of a table of power or energy, or with a nominal voltage; None for others."""
         if (self.role or name) != "power" or (
             self.nominal_voltage_volt is None and not {"power", "energy"} & set(self.columns)
         ):

@@ -1,8 +1,8 @@
-"""Values checked by the annotations of the frozen dataclass that holds them, and made plain: the same rules for TOML and Python.
+"""Check and conversion of a frozen dataclass's values by its annotations, with the same rules for TOML and Python.
 
-msgspec checks each value and describes the annotations as JSON Schema. It stops at the first error; the walk over tables and keys here
-finds all of them. A whole number may be written as a float and a float as a whole number, as in JSON Schema; numpy's scalars and arrays
-become Python's; text is no number, and a truth value neither.
+msgspec checks each value and describes the annotations as JSON Schema. It stops at the first error; the walk over
+tables and keys here finds all of them. A whole number may be written as a float and a float as a whole number, as in
+JSON Schema; numpy's scalars and arrays become Python's; text is no number, nor is a truth value.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _DECIMAL_BITS = 4096
 """Longer whole numbers Python does not write in decimal."""
 _TYPES = {
-    "number": "a number", "integer": "a whole number", "boolean": "true or false", "string": "text in quotes", "object": "a table of keys",
+    "number": "a number", "integer": "a whole number", "boolean": "true or false",
+    "string": "text in quotes", "object": "a table of keys",
 }  # fmt: skip
 
 
 def validate_fields(made: Any, section: str) -> None:
-    """Check every field of a frozen dataclass and keep it as a plain value; `RecipeError` has a line for every wrong one.
+    """Check every field of a frozen dataclass and keep it as a plain value; `RecipeError` lists every wrong field.
 
     ``section`` is the name of its keys before the dot, "" where they have none.
     """
@@ -68,7 +69,7 @@ def read_annotations(cls: type) -> Mapping[str, Any]:
 
 
 def describe(*kinds: Any, file: str = "") -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
-    """Return the JSON Schema of each annotation, and the definitions they refer to; docstrings describe dataclasses and their keys.
+    """Return the JSON Schema of each annotation, and its definitions; docstrings describe dataclasses and keys.
 
     ``file`` holds the definitions; "" is the file of the schema itself.
     """
@@ -184,7 +185,7 @@ def _check_value(kind: Any, value: Any, key: str, problems: list[str]) -> Any:
 
 
 def _to_plain(value: Any) -> Any:
-    """Return a value as msgspec takes it: whole numbers as int, which makes -0.0 a 0; no type accepts NaN, infinity and sets."""
+    """Return a value for msgspec: whole numbers as int (-0.0 is 0); no type accepts NaN, infinity and sets."""
     if hasattr(value, "tolist"):  # numpy scalars and arrays
         value = value.tolist()
     match value:

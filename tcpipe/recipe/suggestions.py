@@ -1,4 +1,4 @@
-"""The parts of a recipe that messages suggest: made here alone, by the recipe's own rules, so that what is suggested is accepted."""
+"""Recipe parts that messages suggest; made only here, by the recipe's own rules, so that the recipe accepts them."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ Keys: TypeAlias = Mapping[str, TomlValue]
 
 @dataclass(frozen=True, slots=True)
 class RecipeFragment:
-    """A part of a recipe: the keys of each table by its dotted name, as ``read.time_offset_s``; an array of tables as a list of them.
+    """Part of a recipe: keys by dotted name of their table, as ``read.time_offset_s``; arrays of tables as lists.
 
-    ``is_checked``: this recipe, or that of the version which wrote it, has accepted it. `RecipeError`: the recipe rejects it.
+    ``is_checked``: this recipe, or that of the version that wrote it, has accepted it. `RecipeError`: the recipe
+    rejects it.
     """
 
     tables: Mapping[str, Keys | Sequence[Keys]]
@@ -65,7 +66,7 @@ def format_first(values: Iterable[float]) -> str:
 def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Remedy, ...]:
     """Return a remedy that changes keys of the recipe; none where the recipe would reject them.
 
-    ``name`` is a key in the catalogue's ``remedies`` of the finding's code; ``tables`` are as those of `RecipeFragment`.
+    ``name``: key in ``remedies`` of the finding's code in the catalogue; ``tables``: as in `RecipeFragment`.
     """
     try:
         RecipeFragment(tables)
@@ -76,7 +77,7 @@ def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Rem
 
 @cache
 def format_recipe_key(name: str) -> str:
-    """Return the dotted name of a key whose value only the reader knows, as a message names it; `RecipeError` for another name."""
+    """Return the dotted name of a key whose value only the reader knows, for messages; `RecipeError` if unknown."""
     section, _, key = name.partition(".")
     known = read_annotations(Recipe)
     if section not in known or (key and key not in read_annotations(known[section])):

@@ -9,6 +9,6 @@
     labelled   = label_segments(segments, config.label)  L4 → L5   each metre gets power, velocity, time, energy
     sampled    = sample_segments(labelled, map)          L5 → L6   each segment gets its rotated patch of the map
 
-`tcpipe.pipeline.ingest_run.run_stages` calls the first five on a log, `tcpipe.pipeline.dataset.build` the last on a map.
-A stage reaches no file.
+`tcpipe.pipeline.ingest_run.run_stages` calls the first five on a log, `tcpipe.pipeline.dataset.build` the last on a
+map. A stage accesses no file.
 """

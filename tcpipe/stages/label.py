@@ -1,4 +1,4 @@
-"""Segments to LabelledSegments: power, velocity, duration and energy of every metre, how wrong they may be, and what to know of them."""
+"""Segments to LabelledSegments: power, velocity, duration and energy of each segment, with uncertainty and findings."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ def label_segments(
 ) -> LabelledSegments:
     """Return the segments with w, v, T, E, their standard deviations, and quality bits.
 
-    Power and energy are null where ``streams`` has no power. The profile ``robot`` gives the range of voltages outside which a label is
-    flagged, and the mass with which the scale of the power is judged.
+    Power and energy are null if ``streams`` has no power. ``robot`` is the profile: its range of voltages flags labels
+    outside it, and its mass serves to verify the scale of the power.
     """
     rule: Rule = "averaged" if streams.power_averaged else config.integration
     parts, joules = [LABELLED_SEGMENTS.empty()], Counter[str]()
@@ -211,7 +211,7 @@ def compute_segment_costs(
 
 
 def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> Floats:
-    """Return the error of each segment's displacement [m], shape (M,): the smoother's, else by the rows' standard deviations."""
+    """Return the error of each segment's displacement [m], shape (M,): the smoother's, else by the rows' σ."""
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     duration_s = (end_ns - start_ns).astype(np.float64) * 1e-9
     lag_std_m = np.column_stack([interpolate(stamp_ns, to_floats(rows, name), start_ns) for name in _DISPLACEMENTS])
@@ -241,7 +241,7 @@ _EDGE_S = 0.3
 def find_idle_power(
     rows: pa.Table, rails: Mapping[int, list[Rail]], *, rate_hz: float, unsettled_s: tuple[float, float]
 ) -> IdlePower:
-    """Return the idle power of all rows of a masked track, and its standard deviation; ``rails`` (by clock epoch) show the resolution."""
+    """Return the idle power of a masked track, with σ; ``rails`` (by clock epoch) give the resolution."""
     piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
     standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STATIONARY)) != 0
     halt = np.full(rows.num_rows, -1)
@@ -279,9 +279,9 @@ def make_fit_samples(table: pa.Table) -> FitSamples:
 
 
 def fit_run_physics(table: pa.Table, idle_watt: float) -> tuple[Floats, PhysicsFacts]:
-    """Return the power [W] that speed, slope and turning of each segment need, NaN without a fit, and the fit of the run.
+    """Return the power [W] by speed, slope and turning of each segment, NaN without a fit, and the run's fit.
 
-    The classes of the ground are unknown here: of mud in a meadow the residual is large, and shows no error.
+    Ground classes are unknown here: mud in a meadow has a large residual without any error.
     """
     metres = make_fit_samples(table)
     watt = idle_watt if np.isfinite(idle_watt) else None

@@ -1,4 +1,4 @@
-"""How the robot moved over every segment of one clock epoch (turn, attitude, slip, vibration), and the quality bits of segments.
+"""Motion over every segment of one clock epoch (turn, attitude, slip, vibration), and the segments' quality bits.
 
 Facts and findings of labelling: the run's energy by entry, the noise floor, the count of every quality bit.
 """
@@ -41,14 +41,14 @@ Arrays = dict[str, Floats]
 _ROLLING_MPS = 0.05
 """Wheels slower than this are stationary: their slip is unknown."""
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
-"""Range of the median specific force [m/s²]: outside, the unit differs or gravity is removed, and the vibration is unknown."""
+"""Range of the median specific force [m/s²]; outside (other unit, gravity removed) the vibration is unknown."""
 
 
 def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: TrackInfo, cost: Labels) -> Arrays:
     """Return the columns `tcpipe.tables.levels.MOTION_COLUMNS` of one epoch's segments ``cut``, shape (M,) each.
 
-    ``rows`` are the epoch's rows of the masked track, ``streams`` hold the IMU's samples, ``cost`` the uncertainty of the segments'
-    velocity.
+    ``rows``: the epoch's rows of the masked track; ``streams``: with the IMU's samples; ``cost``: uncertainty of the
+    segments' velocity.
     """
     epoch = int(to_integers(cut, "clock_epoch")[0])
     imu = select_rows(streams.tables["imu"], "clock_epoch", epoch) if "imu" in streams.tables else None
@@ -79,9 +79,9 @@ def _compute_turns(cut: pa.Table, rows: pa.Table, imu: pa.Table | None, info: Tr
 
 
 def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> Floats:
-    """Return how fast the variance of a yaw change grows [rad²/s], shape (M,): over a metre the gyroscope alone determines it.
+    """Return the growth rate of a yaw change's variance [rad²/s], shape (M,): over 1 m only the gyroscope counts.
 
-    NaN without a gyroscope, and in a forward filter, whose yaw moves with every measurement.
+    NaN without a gyroscope, and for a forward filter, whose yaw changes with every measurement.
     """
     start_ns, density = to_integers(cut, "start_ns"), np.full(cut.num_rows, np.nan)
     facts = info.report.facts.fuse
@@ -110,7 +110,7 @@ def _compute_slip(cut: pa.Table, rows: pa.Table, cost: Labels) -> Arrays:
 
 
 def _compute_vibration(imu: pa.Table | None, start_ns: Ints, end_ns: Ints) -> Arrays:
-    """Return the vibration and its standard deviation; NaN without an IMU that measures the specific force with gravity."""
+    """Return the vibration and its standard deviation; NaN without an IMU that measures specific force with gravity."""
     found = np.full(len(start_ns), np.nan), np.full(len(start_ns), np.nan)
     if imu is not None:
         force = np.column_stack([to_floats(imu, f"linear_acceleration_{axis}_mps2") for axis in "xyz"])
@@ -125,7 +125,7 @@ Flags = dict[Quality, Mask]
 
 
 def find_power_flags(cut: pa.Table, rails: list[Rail], *, range_volt: tuple[float, float] | None) -> Flags:
-    """Return the flags that the power samples of one epoch give its segments; without a range of voltages [V] none is out of it."""
+    """Return the flags of one epoch's segments by its power samples; without a range [V] no voltage is outside it."""
     spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     return {
         Quality.LOW_POWER_RATE: np.full(cut.num_rows, has_low_power_rate(rails)),
@@ -138,7 +138,8 @@ def find_motion_flags(
 ) -> Flags:
     """Return the flags that the masked rows of one epoch give its segments.
 
-    A segment is flagged that is more curved than ``arc_to_chord`` or has an end less certain than ``max_position_std_m`` [m].
+    A segment is flagged if it is more curved than ``arc_to_chord`` or an end is less certain than
+    ``max_position_std_m`` [m].
     """
     stamp_ns, start_ns, end_ns = to_integers(rows, "stamp_ns"), to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     chord_m = to_floats(cut, "chord_m")
@@ -195,8 +196,8 @@ def _find_gap_edges(rows: pa.Table, rate_hz: float) -> Mask:
 def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     """Return whether a clock of the run stepped or has an offset, or motion or power has the recorder's time.
 
-    Commands mostly have no stamp of their own, and labels do not depend on it. An offset that is known is taken out; σ of w and E
-    contains the delay of power.
+    Commands mostly have no stamp of their own, and labels do not depend on it. A known offset is corrected; σ of w and
+    E contains the delay of power.
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     offsets = (offset for clocks in info.report.facts.clock_offsets for offset in clocks.offsets.values())
@@ -306,8 +307,8 @@ def _compute_median(values: Floats) -> float | None:
 def sum_energy_entries(rows: pa.Table, rails: list[Rail], *, rate_hz: float, rule: Rule) -> dict[str, float]:
     """Return the energy of one epoch's rows by entry of the breakdown [J]; their sum is all that was recorded.
 
-    Entries are every `DropReason` by name, ``steady`` (kept, curved and leftover), and ``outside_track`` (recorded before the track begins
-    or after it ends). ``rate_hz`` is the track's.
+    Entries are every `DropReason` by name, ``steady`` (kept, curved and leftover), and ``outside_track`` (before or
+    after the track). ``rate_hz`` is the track's.
     """
     stamp_ns = to_integers(rows, "stamp_ns")
     piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)

@@ -1,4 +1,4 @@
-"""Errors that all segments of a run share (gain and zero of the power sensor, scale of a lone odometry), and findings on them."""
+"""Errors common to all segments of a run (gain and zero of power, scale of a lone odometry), and their findings."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from tcpipe.tables.levels import Streams, TrackInfo
 
 
 def find_stationary_ns(rows: pa.Table, rate_hz: float, *, but: int = 0) -> Ints:
-    """Return begin and end [ns] of every span in which the robot is stationary, and not in another way, shape (S, 2)."""
+    """Return begin and end [ns] of the spans that are stationary and have none of the reasons ``but``, shape (S, 2)."""
     stamp_ns = to_integers(rows, "stamp_ns")
     piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
     reasons = to_numbers(rows["dropped_by"])
@@ -55,7 +55,7 @@ def find_stationary_ns(rows: pa.Table, rate_hz: float, *, but: int = 0) -> Ints:
 def audit_power_sensor(
     rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]], info: TrackInfo, config: LabelConfig
 ) -> PowerSensorFacts:
-    """Return what is not known of the power sensor: by the recipe, else by the kind of source and by what the run shows.
+    """Return the power sensor's uncertainty: by the recipe, else by the kind of source and by evidence in the run.
 
     ``rows`` are those of the masked track.
     """
@@ -159,7 +159,8 @@ def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> I
     if (smoothing := facts.smoothing) is not None:
         yield make_finding(
             "power-smoothed", _POWER,
-            remedies=suggest("correct", {"read.time_offset_s": {"power": given_s - smoothing.late_s}}) if smoothing.late_s else (),
+            remedies=suggest("correct", {"read.time_offset_s": {"power": given_s - smoothing.late_s}})
+            if smoothing.late_s else (),
             width_s=smoothing.width_s, late_s=smoothing.late_s,
         )  # fmt: skip
     delay_s, delay_std_s = facts.delay_s or (0.0, 0.0)
@@ -183,7 +184,7 @@ _NEGATIVE = "idle-power-negative"
 def find_negative_idle(
     idle: IdlePower, driving_watt: float | None, power: PowerSign | None, rails: Sequence[Rail]
 ) -> Iterator[Finding]:
-    """Yield that power is clearly negative in every halt, and the lines that correct it; not while the battery is charged."""
+    """Yield a finding, with remedy, if power is clearly negative in every halt and the battery is not being charged."""
     if power is None or power.charging or driving_watt is None:
         return
     least_watt = read_threshold(_NEGATIVE, "min_driving_fraction") * driving_watt
@@ -213,7 +214,8 @@ def find_unpowered_motion(
 ) -> Iterator[tuple[slice, Finding]]:
     """Yield the rows and the finding of each span in which the robot moves with its idle power.
 
-    The power [W] that speed and slope of these segments need, of ``needed_watt``, shape (M,), exceeds the idle power clearly.
+    The power [W] that speed and slope of these segments need, ``needed_watt``, shape (M,), clearly exceeds the idle
+    power.
     """
     watt = to_floats(table, "power_watt")
     idle_watt, fit = physics.idle_watt, physics.fit
@@ -241,7 +243,7 @@ def find_unpowered_motion(
 
 
 def make_sensor_error(cut: pa.Table, rails: list[Rail], facts: PowerSensorFacts, *, rule: Rule) -> SensorError:
-    """Return what the power sensor's errors change of one epoch's segments: the zeros of several rails are independent, gains are not."""
+    """Return one epoch's segment errors by the power sensor: zeros of rails are independent, gains are common."""
     spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     offsets = [
         integrate_energy(

@@ -1,7 +1,7 @@
 """Witnesses of position, time and energy of a run: measurements that do not enter the label.
 
-An internal consistency check is no witness. A witness that contradicts a label makes it unusable; a label without a witness is
-"confirmed by nothing" and at best usable with care.
+An internal consistency check is no witness. A witness that contradicts a label makes it unusable; a label without a
+witness is "confirmed by nothing" and at best usable with care.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class _Comparison:
         return float(max(np.log(abs(self.ratio) / self.high), np.log(self.low / max(abs(self.ratio), 1e-9))))
 
     def find_scale(self) -> float:
-        """Return the power of ten that brings the ratio nearest to the middle of the range, as a factor on the current."""
+        """Return the power of ten, a factor on the current, that brings the ratio nearest to its range's middle."""
         return float(10.0 ** -round(np.log10(abs(self.ratio) / np.sqrt(self.low * self.high))))
 
 
@@ -108,7 +108,7 @@ def _find_energy_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> 
 
 
 def _make_implausible(worst: _Comparison, comparisons: list[_Comparison]) -> Finding:
-    """Return the finding that a witness contradicts the scale of power; only a warning where another witness confirms it."""
+    """Return the finding that a witness contradicts the scale of power; a warning if another one confirms it."""
     bound, limit = ("largest", worst.high) if worst.ratio > worst.high else ("smallest", worst.low)
     scale = worst.find_scale()
     is_clear = worst.excess > np.log(read_threshold(IMPLAUSIBLE, "min_unit_excess_ratio"))

@@ -38,8 +38,8 @@ def mask_track(
 
     Parameters
     ----------
-    max_velocity_mps, max_plausible_mps : [m/s], of the robot's profile; the recipe's take precedence. Without a maximum, no row is
-        dropped as below the limit.
+    max_velocity_mps, max_plausible_mps : [m/s], of the robot's profile; the recipe has priority. Without a maximum, no
+        row is masked as below the limit.
     chord_m : [m], length of a segment, over which the relative position error counts.
     """
     table, period_s = track.table, 1.0 / track.info.rate_hz
@@ -129,9 +129,9 @@ def _find_motion_reasons(rows: MotionRows, config: MaskConfig) -> dict[DropReaso
 
 
 def _find_accelerating(rows: MotionRows, halted: Mask, config: MaskConfig) -> Mask:
-    """Mark commanded changes, ramps beside halts, and lasting accelerations where no command is known or one is about to fall silent.
+    """Mark commanded changes, ramps beside halts, and lasting accelerations without a command or just before it ends.
 
-    Before a silence the command may have changed unseen: the last one is still held.
+    Before the commands end, a change may be missing: the last command is extended.
     """
     slope = masks.estimate_forward_acceleration_mps2(rows, window_s=config.acceleration_window_s)
     lasting = masks.find_accelerating(
@@ -165,7 +165,7 @@ class SpeedLimit:
 
 
 def find_speed_limit(rows: MotionRows, config: MaskConfig, *, max_velocity_mps: float | None) -> SpeedLimit:
-    """Return the limit of a run, of a robot whose profile states ``max_velocity_mps`` [m/s]; the recipe has priority."""
+    """Return a run's speed limit; ``max_velocity_mps`` [m/s] is the profile's, and the recipe has priority."""
     top, held = masks.find_top_command(
         rows,
         moving_above_mps=config.turning_velocity_mps,
@@ -229,7 +229,8 @@ def find_gaps(
 ) -> tuple[dict[str, Mask], tuple[Finding, ...]]:
     """Return the rows that are in a gap by cause, and the findings; a row may have several causes.
 
-    An error of scale that all of a run has in common makes no segment worse than the next: it is not part of a chord's own uncertainty.
+    An error of scale that is common to the whole run makes no segment worse than the next: it is no part of a chord's
+    own uncertainty.
     """
     power = to_floats(track.table, "power_watt")
     without_power = np.isnan(power) & bool(np.isfinite(power).any())
@@ -284,7 +285,7 @@ def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config:
 
 
 def _compute_common_std_mps(track: Track) -> Floats:
-    """Return the part of each row's velocity standard deviation that its section has in common: that of an unobservable scale."""
+    """Return the part of each row's velocity σ that is common in its section: of an unobservable scale."""
     table = track.table
     speed_mps = np.linalg.norm([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], axis=0)
     scale_std = find_common_scale_std(
@@ -304,7 +305,7 @@ _DRIVES_MPS = 0.1
 
 
 def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: float) -> tuple[Mask, tuple[Finding, ...]]:
-    """Return the rows faster than a limit [m/s], by velocity or by the step between two rows, and the finding; a jump is not a speed.
+    """Return the rows above a limit [m/s] by velocity or by the step between two rows (jumps excepted), and findings.
 
     Raises `FusionError`: the moving median of the speed, over a minute of driving, exceeds the limit.
     """

@@ -1,4 +1,4 @@
-"""The log as stages see it (`LogReader`); its tables as numpy arrays and power rails; a pose of another program as fixes."""
+"""Interface of logs to stages (`LogReader`); tables as numpy arrays and power rails; foreign poses as fixes."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ class LogReader(Protocol):
         """Every topic by name, by the log's index."""
 
     def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
-        """Return a table a topic: one row a message in the order of log time, ``log_time_ns``, ``publish_time_ns``, fields by dotted name.
+        """Return a table a topic, rows in log time order: ``log_time_ns``, ``publish_time_ns``, fields by dotted name.
 
         A topic that cannot be decoded is missing from the result.
         """
 
     def batches(self, topics: Sequence[str]) -> Iterator[Mapping[str, pa.Table]]:
-        """Yield the same piece by piece: each the next rows of some topics; a message that lies far behind its time comes later."""
+        """Yield these tables piecewise: the next rows of some topics; a message far behind its time comes later."""
 
 
 def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> Arrays:
-    """Return a table's columns: numbers as they are, texts as str, lists of numbers as (N, k) with NaN where a row is shorter.
+    """Return a table's columns: numbers, texts as str, lists of numbers as (N, k) with NaN after shorter rows.
 
-    Of lists of messages only the numbers are read that ``in_lists`` names, as ``drivers[].current``, and of lists of texts those that it
-    names, as ``name[]`` (128 letters, "" where a row is shorter): they are (N, k) as well.
+    Of lists of messages only the numbers in ``in_lists`` are read, as ``drivers[].current``, and of lists of texts
+    those in it, as ``name[]`` (128 letters, "" after shorter rows): these are (N, k), too.
     """
     found: Arrays = {}
     for name in table.column_names:
@@ -118,7 +118,7 @@ def _fill_nulls(lengths: Ints, flat: pa.Array) -> Floats:
 
 
 def _fill_rows(lengths: Ints, values: NDArray[T], empty: float | str) -> NDArray[T]:
-    """Return values of lists, one after the other, as a row a list, shape (N, k); ``empty`` where one is shorter than the longest."""
+    """Return the concatenated values of lists as one row a list, shape (N, k), filled with ``empty``."""
     if len(lengths) and lengths.min() == lengths.max():
         return values.reshape(len(lengths), int(lengths[0]))
     matrix = np.full((len(lengths), int(lengths.max(initial=0))), empty, values.dtype)
@@ -151,7 +151,7 @@ def gather_messages(
 ) -> tuple[dict[str, Arrays], dict[str, pa.Table]]:
     """Return the messages of a log by topic, in order of log time: ``played`` topics as arrays, others as tables.
 
-    ``batches`` are tables by topic, piece after piece; ``played`` names with each topic the numbers inside lists of messages (see
+    ``batches``: tables by topic, piece after piece; ``played``: by topic, the numbers inside lists of messages (see
     `make_message_arrays`). Columns that never change are read-only and need the memory of one row.
     """
     pieces: dict[str, list[Arrays]] = {}
@@ -217,7 +217,7 @@ def _sort_columns(columns: Arrays) -> Arrays:
 
 
 def make_rails(streams: Streams, epoch: int) -> list[Rail]:
-    """Return the drive rails of one clock epoch, for all who ask for power, in the order of their names; none without power."""
+    """Return the drive rails of one clock epoch, for all users of power, ordered by name; none without power."""
     table = streams.tables.get("power")
     if table is None:
         return []
@@ -235,7 +235,8 @@ def make_rails(streams: Streams, epoch: int) -> list[Rail]:
 
 
 _ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
-"""Longitude, latitude [deg] and height [m] at which a frame without a place on the earth is fused; east, north and up stay the same."""
+"""Assumed longitude, latitude [deg] and height [m] of a frame without a position on the earth; east, north and up do
+not change."""
 
 
 def find_fixes_role(streams: Streams) -> str:

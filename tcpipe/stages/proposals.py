@@ -1,7 +1,7 @@
 """Proposals for a recipe: fixes, inertial measurements and power in unknown messages, by names and values.
 
-`tcpipe inspect`, `preflight`, `ingest` and `init --from` use them. Values that contradict the names exclude a proposal; ``doubt`` states
-what remains to be checked.
+`tcpipe inspect`, `preflight`, `ingest` and `init --from` use them. Values that contradict the names exclude a proposal;
+``doubt`` states what remains to be checked.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _UNSETTLED: Keys = {"sign": "auto", "averaging_unknown": True}
 def find_proposals(
     log: LogReader, assignment: RoleAssignment, config: ReadConfig, known: Profiles
 ) -> tuple[Finding, ...]:
-    """Return what could play roles that nothing plays; nothing for roles that the recipe speaks of. The log is read once."""
+    """Return proposals for roles without a topic that the recipe does not mention. The log is read once."""
     readable = [topic for topic in log.topics.values() if topic.problem is None and topic.message_count != 0]
     free = [of for of in readable if of.name not in config.ignore_topics and not of.name.startswith(OVERLAY)]
     settled, types = {*assignment.roles, *config.topics}, {topic.type_name for topic in free}
@@ -67,7 +67,7 @@ def _may_be_power(topic: Topic, known_types: Collection[str]) -> bool:
 def _propose_roles(
     matched: Mapping[tuple[str, Topic], Mapping[str, str]], columns: Mapping[str, Columns]
 ) -> Iterator[Finding]:
-    """Yield a finding for each message type that no role knows and whose fields are called as those of a role that nothing can play."""
+    """Yield a finding for each unknown message type with fields named like those of a role that has no topic."""
     for (role, topic), found in matched.items():
         own = columns.get(topic.name, {})
         if set(found.values()) <= set(own):
@@ -79,9 +79,9 @@ def _propose_roles(
 
 
 def judge_fields(role: str, found: Mapping[str, str], columns: Columns) -> tuple[dict[str, str], str]:
-    """Return what each field of ``gnss`` or ``imu`` is taken from, with the factor that its values show, and what they leave open.
+    """Return the source of each field of ``gnss`` or ``imu``, with the factor by its values, and what is unclear.
 
-    ``found`` are the names that are matched, ``columns`` their values by field.
+    ``found``: matched names; ``columns``: their values by field.
     """
     values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
     values = {name: value[np.isfinite(value) & (value != 0.0)] for name, value in values.items()}
@@ -111,7 +111,7 @@ def _judge_fixes(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[d
 
 
 def _judge_imu(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[dict[str, str], str]:
-    """Judge accelerations by gravity, the median of each axis; beside accelerations in g, fast turn rates are in deg/s."""
+    """Judge accelerations by gravity, the median of each axis; beside accelerations in g, high rates are in deg/s."""
 
     def measure(begin: str) -> float:
         axes = [np.median(np.abs(of)) for name, of in values.items() if name.startswith(begin) and of.size]
@@ -135,7 +135,7 @@ _FASTEST_MEDIAN_RADPS = 0.3
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """Topics that could be power together: the tables that read them, the range of their values, and what is unclear."""
+    """Topics that could be power together: their recipe tables, the range of their values, and what is unclear."""
 
     topics: tuple[str, ...]
     sources: tuple[Keys, ...]
@@ -144,7 +144,7 @@ class _Candidate:
 
 
 def _propose_power(topics: Sequence[Topic], columns: Mapping[str, Columns]) -> list[Finding]:
-    """Return what could be power in a log without a power topic: bare numbers, then messages of the user's own, then torques."""
+    """Return candidates for power in a log without a power topic: bare numbers, then own messages, then torques."""
     bare = [topic for topic in topics if topic.type_name in FLOAT_TYPES]
     own = [topic for topic in topics if topic.type_name not in (*FLOAT_TYPES, JOINT_STATE)]
     found = [*_find_bare(bare, columns)] or [*_find_own(own, columns)] or [*_find_joints(topics, columns)]
@@ -168,7 +168,7 @@ _THOUSANDTHS = {"voltage-in-millivolts": "voltage_scale", "current-in-milliamper
 
 
 def _judge_source(columns: Columns, topic: str, keys: Keys, numbers: dict[str, float]) -> Keys | None:
-    """Return a power source with the factors that make its values plausible, and add their range to ``numbers``; None where none does."""
+    """Return a power source with plausible factors, and add its range to ``numbers``; None without such factors."""
     made: dict[str, Any] = {**keys}
     for _ in range(3):
         found = read_rails(columns, [PowerSource(**made)], topic)
@@ -199,7 +199,7 @@ def _find_bare_quantity(topic: str) -> str:
 
 
 def _find_bare(bare: Sequence[Topic], columns: Mapping[str, Columns]) -> Iterator[_Candidate]:
-    """Yield what topics of bare numbers make: rails of voltage and current, or powers, or currents without a voltage."""
+    """Yield candidates of bare numbers: rails of voltage and current, or powers, or currents without a voltage."""
     numbers = dict[str, float]()
     judged: dict[str, list[Keys]] = {"voltage": [], "current": [], "power": []}
     for topic in bare:
@@ -223,7 +223,7 @@ NO_VOLTAGE = "nothing is a voltage: state that of the battery"
 
 
 def _pair_rails(voltages: Sequence[Keys], currents: Sequence[Keys]) -> list[Keys]:
-    """Return each rail's voltage and current: called alike, or all currents at the only voltage; of drives alone where some are."""
+    """Return rails of equal name, or all currents at the only voltage; only those of drives if there are any."""
     by_rail = {keys["rail"]: keys for keys in voltages}
     used: list[Keys] = []
     for keys in [current for current in currents if is_of_drives(str(current["topic"]))] or currents:
@@ -235,7 +235,7 @@ def _pair_rails(voltages: Sequence[Keys], currents: Sequence[Keys]) -> list[Keys
 
 
 def _find_own(own: Sequence[Topic], columns: Mapping[str, Columns]) -> Iterator[_Candidate]:
-    """Yield the messages of the user's own that hold voltage and current, or power; topics of a type that differ by side are summed."""
+    """Yield own messages with voltage and current, or power; topics of a type that differ by side are summed."""
     groups: dict[tuple[str, tuple[str, ...]], list[Topic]] = {}
     for topic in own:
         groups.setdefault((topic.type_name, split_sides(topic.name)[0]), []).append(topic)

@@ -62,11 +62,12 @@ def decide_roles(config: ReadConfig, topics: Iterable[Topic], robot: str | None,
     )
     if assignment.problems:
         return assignment
-    # An offset is of one clock that was off: where it corrects nothing, the log is another's. The other keys are of the robot, and hold
-    # for logs without that sensor as well.
+    # An offset belongs to one wrong clock: without effect, the recipe is for another log. Other keys describe the
+    # robot, and are valid for logs without that sensor, too.
     there = ", ".join(assignment.roles)
     problems = tuple(
-        f"recipe read.time_offset_s.{role}: no topic of this log is used as {role}, so it has no effect; roles in the log: {there}"
+        f"recipe read.time_offset_s.{role}: no topic of this log is used as {role}, so it has no effect; "
+        f"roles in the log: {there}"
         for role in config.time_offset_s
         if role not in assignment.roles
     )

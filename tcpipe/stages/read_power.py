@@ -34,7 +34,7 @@ def read_power_of_topics(
     known: Profiles,
     meters: Mapping[str, tuple[str, Columns]],
 ) -> PowerReadings:
-    """Return the rails of the topics used as power, by message type and columns; none unless all of them can be decoded.
+    """Return the rails of the topics used as power, by message type and columns; none unless all can be decoded.
 
     ``meters`` are power topics that are not used; the power is compared with them.
     """
@@ -79,7 +79,7 @@ _STRAIGHT_RADPS, _MOVING_MPS, _STILL_MPS = 0.05, 0.2, 0.01
 
 
 def add_side_share(power: PowerReadings, streams: Mapping[str, pa.Table]) -> PowerReadings:
-    """Return the power with the share of one side in the current of straight driving, above that at rest, if an odometry is known."""
+    """Return power with one side's share of the current in straight driving above that at rest (needs an odometry)."""
     motion = _choose_odometry(streams)
     if power.facts is None or power.sides is None or motion is None:
         return power
@@ -221,9 +221,9 @@ class RepeatedValues:
 
 
 def remove_repeats(streams: Streams) -> tuple[Streams, list[RepeatedValues]]:
-    """Return the streams with only the readings of power, and what was repeated; a table that repeats none stays as it is.
+    """Return the streams with only new readings of power, and the repeats; unchanged if there are no repeats.
 
-    A reading has the stamp of the first message that holds it.
+    A reading has the stamp of its first message.
     """
     power = streams.get("power")
     if power is None:
@@ -252,7 +252,7 @@ def remove_repeats(streams: Streams) -> tuple[Streams, list[RepeatedValues]]:
 
 
 def _find_readings(at_ns: Ints, own: Ints, quantity: str, values: Values) -> Ints | None:
-    """Return the rows of a quantity's readings, by its own changes or, where these hardly show, by those of the other on the same rows."""
+    """Return the rows of a quantity's readings, by its own changes or, if these are unclear, by both quantities'."""
     found = find_readings(at_ns[own], values[quantity][own, None])
     if found is None and all(np.isfinite(value[own]).all() for value in values.values()):
         found = find_readings(at_ns[own], np.stack([value[own] for value in values.values()], axis=-1))
@@ -265,7 +265,7 @@ def _rate_hz(at_ns: Ints) -> float:
 
 
 def find_repeats(repeats: Sequence[RepeatedValues]) -> Iterator[Finding]:
-    """Yield the finding that messages repeat readings, by the slowest of them; labelling finds whether that is too slow."""
+    """Yield the finding that messages repeat readings, for the slowest; labelling decides whether it is too slow."""
     if not repeats:
         return
     slowest = min(repeats, key=lambda repeat: repeat.reading_hz)

@@ -1,7 +1,7 @@
 """The topics that are used as a role: their messages as arrays, usable readings, and the extrinsics of their sensors.
 
-A sensor's extrinsics come from the recipe, from static transforms, or are assumed, with a finding. A pose that another program estimated
-(SLAM, post-processing) gets longitude and latitude where the recipe states its CRS; it is used as GNSS.
+A sensor's extrinsics come from the recipe or from static transforms, or are assumed, with a finding. Another program's
+pose (SLAM, post-processing) gets longitude and latitude if the recipe states its CRS; it is used as GNSS.
 """
 
 from __future__ import annotations
@@ -65,11 +65,11 @@ def read_sources(
     *,
     known: Profiles,
 ) -> tuple[list[TopicReadings], PowerReadings, list[Finding]]:
-    """Return one `TopicReadings` a topic in the order of the roles, the power rails, and findings on topics that cannot be decoded.
+    """Return one `TopicReadings` a topic by role order, the power rails, and findings on topics not decoded.
 
-    Messages are removed from ``messages`` as they are read, so that no log is in memory twice.
+    Messages are removed from ``messages`` once read, so that no log is in memory twice.
 
-    Raises `RoleError`: ``read.fields`` names what the messages do not hold.
+    Raises `RoleError`: ``read.fields`` names fields that the messages lack.
     """
     played = [(cast("Role", role.name), topic) for role in assignment.roles.values() for topic in role.topics]
     findings: list[Finding] = []
@@ -112,9 +112,9 @@ def read_sources(
 
 
 def _join_topics(sources: Sequence[TopicReadings], config: ReadConfig, findings: list[Finding]) -> list[TopicReadings]:
-    """Return of each role the first topic, and what others in its frame measured while those in front of them had no messages.
+    """Return the first topic of each role, with data of others in its frame while earlier topics have no messages.
 
-    A role has one frame and one place. Findings are added on topics that are not used, or in part.
+    A role has one frame and one set of extrinsics. Findings are added on topics that are unused, or used in part.
     """
     joined: dict[Role, list[TopicReadings]] = {}
     for source in sources:
@@ -239,9 +239,9 @@ def place_frames(
     frame_of: Mapping[Role, str],
     config: ReadConfig,
 ) -> dict[Role, tuple[Pose, str]]:
-    """Return by role where its frame is in base_link, and what says so.
+    """Return by role its frame's pose in base_link, and the source.
 
-    /tf is read only where /tf_static leaves a frame unplaced: it is large, and constant only in logs that lack the other.
+    /tf is read only if /tf_static lacks a frame: it is large, and constant only in logs without /tf_static.
     """
     open_frames = {
         frame

@@ -40,10 +40,10 @@ _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAV
 class Sampled:
     """L6 before the split: N patches of M segments, from one map or several.
 
-    ``kept`` are the rows of the segments that have a patch, (N,), rising on each map; all else of N is in that order. ``map_index`` says
-    which map each is on. Footprints are counter-clockwise from rear right, (N, 4, 2): in the first map's CRS [m], and as WGS 84 lon, lat
-    [deg]. ``position_std_m`` is their DRMS, (N,), with that of the run's shift. ``lost_by`` is each segment's `Loss`, 0 if kept, (M,).
-    Where pixels wait in files, those of ``patches`` are empty.
+    ``kept``: rows of the segments with a patch, (N,), rising on each map; all other N are in that order. ``map_index``:
+    the map of each. Footprints are counter-clockwise from rear right, (N, 4, 2): in the first map's CRS [m], and as WGS
+    84 lon, lat [deg]. ``position_std_m``: their DRMS, (N,), with that of the run's shift. ``lost_by``: each segment's
+    `Loss`, 0 if kept, (M,). If pixels are stored in files, those of ``patches`` are empty.
     """
 
     kept: Ints
@@ -67,12 +67,13 @@ def sample_segments(
 ) -> Sampled:
     """Return the patches of all segments that are on the map.
 
-    Raises `TableError`: chords and positions contradict each other; `MapError`: CRSs cannot be connected, or a tile is damaged.
+    Raises `TableError`: chords and positions contradict each other; `MapError`: no transformation between CRSs, or a
+    damaged tile.
 
     Parameters
     ----------
-    segments : L5 of any runs, or `PLACED_SEGMENTS` of it; of several reasons the first counts: position uncertain, off the map, nodata,
-        untraversable.
+    segments : L5 of any runs, or `PLACED_SEGMENTS` of it; the first reason of loss counts, in the order: position
+        uncertain, off the map, nodata, untraversable.
     source, pool : the map, and its tiles as `sample_patches` takes them.
     gnss_crs : geographic CRS of the segments' longitudes and latitudes.
     shifts : of runs on this map.
@@ -114,8 +115,9 @@ def place_segments(segments: pa.Table, place: Projection | NDArray[np.integer], 
     Parameters
     ----------
     segments : L5 of any runs.
-    place : the projection from the segments' longitudes and latitudes to the plane of the footprints; or, of runs in local frames, the
-        number of each segment's run, shape (M,): they are placed side by side in that order (`separate_frames`).
+    place : projection from the segments' longitudes and latitudes to the plane of the footprints; or, for runs in local
+        frames, the number of each segment's run, shape (M,): they are placed side by side in that order
+        (`separate_frames`).
     """
     count = segments.num_rows
     if isinstance(place, Projection):
@@ -151,11 +153,11 @@ def place_segments(segments: pa.Table, place: Projection | NDArray[np.integer], 
 
 _ENDS = ("start", "end")
 _FRAME_STEP_M = 100.0
-"""Local frames are moved by multiples of it: blocks of the split stay whole if they are of 1, 2, 5, 10, 20, 25 or 50 m."""
+"""Step by which local frames are moved [m]: split blocks of 1, 2, 5, 10, 20, 25 or 50 m stay whole."""
 
 
 def separate_frames(frame: NDArray[np.integer], ends_xy_m: Sequence[Floats]) -> list[Floats]:
-    """Return points of local frames in one plane [m], each shape (N, 2): a later frame begins behind the earlier ones along x.
+    """Return points of local frames in one plane [m], each shape (N, 2): later frames begin farther along x.
 
     ``frame`` is the number of each point's frame, shape (N,).
     """
@@ -203,7 +205,7 @@ def _find_in_map(source: MapReader, config: SampleConfig, projection: Projection
 
 
 _ELSEWHERE = (Loss.OUTSIDE_MAP, Loss.NODATA)
-"""A segment lost so on one map may be on the next; one on untraversable ground or of uncertain position is lost on all."""
+"""Losses that may not occur on the next map; untraversable ground and uncertain positions are final."""
 
 
 def sample_on_maps(
@@ -215,11 +217,11 @@ def sample_on_maps(
     pools: Sequence[TilePool | None] | None = None,
     shifts: Sequence[Shifts] | None = None,
 ) -> Sampled:
-    """Return the patches of all segments that are on one of the maps; where maps overlap, the earlier one counts.
+    """Return the patches of all segments that are on one of the maps; where maps overlap, the first counts.
 
     Parameters as `sample_segments`; ``pools`` and ``shifts`` have one a map.
 
-    Raises `TableError`, `MapError`: as `sample_segments`; the maps have not the same layers or classes, or are too far apart.
+    Raises `TableError`, `MapError`: as `sample_segments`; maps with different layers or classes, or too far apart.
     """
     check_same_layers(sources)
     lost_by = np.full(segments.num_rows, Loss.OUTSIDE_MAP, np.uint32)
@@ -252,7 +254,7 @@ def _project_to_first_map(sampled: Sampled, source: MapReader, first: MapReader)
 
 
 def check_same_layers(sources: Sequence[MapReader]) -> None:
-    """Raise `MapError` if the maps have not the same layers and classes: their patches could not be learned from together."""
+    """Raise `MapError` if the maps' layers or classes differ: no model can learn from their patches together."""
     first, problems = sources[0], []
     layers, *others = (source.layers for source in sources)
     for other, theirs in zip(sources[1:], others, strict=True):

@@ -1,4 +1,4 @@
-"""Bits of ``dropped_by`` (track rows) and ``quality`` (segments), entries of the distance breakdown; released bits keep their value."""
+"""Bits of ``dropped_by`` (track rows) and ``quality`` (segments), entries of the distance breakdown; values stay."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class DropReason(IntFlag):
     """Why a row of the track is not used; 0 means kept. The order is the precedence in the distance breakdown."""
 
     GAP = 1 << 0
-    """No usable motion or power estimate: sensor gap, power gap, clock epoch, a jump, or relative position error too large."""
+    """No usable motion or power: sensor gap, power gap, clock epoch, jump, or too large relative position error."""
     STATIONARY = 1 << 1
     """|v| < 0.05 m/s and |yaw rate| < 0.05 rad/s."""
     STUCK = 1 << 2
@@ -29,13 +29,13 @@ class DropReason(IntFlag):
     REVERSING = 1 << 4
     """Driving backwards."""
     ACCELERATING = 1 << 5
-    """A commanded change of speed (2 s after it), or, without commands, |dv/dt| > 0.3 m/s² for 0.2 s; start and stop ramps."""
+    """Change of the commanded speed (2 s after it); without commands: |dv/dt| > 0.3 m/s² for 0.2 s; start, stop."""
     BELOW_FULL_SPEED = 1 << 6
     """Commanded below 0.95 of the robot's maximum: the terrain does not limit the speed."""
     TIME_WINDOW = 1 << 7
     """Outside the time windows of the recipe (`mask.windows`); no other reason counts there."""
     POSITION_UNCERTAIN = 1 << 8
-    """Standard deviation of the horizontal position (DRMS) above `mask.max_position_std_m`; off unless the recipe states a limit."""
+    """Standard deviation of the horizontal position (DRMS) above `mask.max_position_std_m`; off without a limit."""
 
 
 class Quality(IntFlag):
@@ -48,7 +48,7 @@ class Quality(IntFlag):
     HIGH_SLIP = 1 << 2
     """Wheel speed and ground speed differ by more than 20 %."""
     WEAK_GNSS = 1 << 3
-    """Standard deviation of the horizontal position (DRMS, `position_std_m`) above `label.flag_position_std_m` at either end."""
+    """Standard deviation of the horizontal position (DRMS) above `label.flag_position_std_m` at either end."""
     CURVED = 1 << 4
     """Arc over chord above 1.01."""
     POWER_MEAN_MISMATCH = 1 << 5
@@ -67,7 +67,7 @@ class Quality(IntFlag):
     UNPOWERED = 1 << 12
     """The robot moves with its idle power over several segments, though their speed and slope need clearly more."""
     MAP_CONTRADICTS_TRACK = 1 << 13
-    """Samples only: slope, cross slope or heights of the patch differ from those of the track (`map-contradicts-track`)."""
+    """Samples only: slope, cross slope or heights of the patch differ from the track (`map-contradicts-track`)."""
 
 
 class Loss(IntFlag):
@@ -84,7 +84,7 @@ class Loss(IntFlag):
     NOT_TRAVERSABLE = 1 << 20
     """The class under the chord is not traversable."""
     POSITION_UNCERTAIN = 1 << 21
-    """Standard deviation of the horizontal position above `sample.max_position_std_m` when sampling; adds to that of the mask."""
+    """Standard deviation of the horizontal position above `sample.max_position_std_m` when sampling."""
     SPLIT_BUFFER = 1 << 22
     """The footprint crosses the border of a region, or is nearer to it than the buffer."""
     NO_POWER = 1 << 23

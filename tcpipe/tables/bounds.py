@@ -1,4 +1,4 @@
-"""The bounds of a number, stated in its annotation: ``Annotated[float, Bounds(ge=0, le=1)]``. msgspec checks and describes them."""
+"""Bounds of a number in its annotation, ``Annotated[float, Bounds(ge=0, le=1)]``, checked and described by msgspec."""
 
 from msgspec import Meta as Bounds
 

@@ -1,6 +1,6 @@
 """A column with its unit and meaning, and a table schema that checks Arrow tables against its columns.
 
-The Arrow field metadata contain units, frames, flag bits and one-line meanings, so that every Parquet file explains itself.
+Arrow field metadata contain units, frames, flag bits and one-line meanings, so that every Parquet file explains itself.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tcpipe.tables.bits import flag_name
 
 
 def to_numbers(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
-    """Return a column of numbers or truth values, shape (N,), perhaps read-only; whole numbers with nulls as float64, null as NaN."""
+    """Return a numeric or Boolean column, shape (N,), possibly read-only; integers with nulls as float64, null: NaN."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if pa.types.is_boolean(array.type) and not array.null_count:
         return np.from_dlpack(array.cast(pa.uint8())).view(np.bool_)
@@ -79,7 +79,7 @@ _LITTLE_ENDIAN = 1
 
 
 def make_lines(start_deg: Floats, end_deg: Floats) -> pa.Array:
-    """Return the straight lines between points x, y, shape (N, 2) each, as LineStrings; null where an end is not known (NaN)."""
+    """Return the straight lines between points x, y, shape (N, 2) each, as LineStrings; null if an end is NaN."""
     ends = np.unwrap(np.stack([start_deg, end_deg], axis=1), axis=1, period=360.0)  # short on the date line too
     rows = np.zeros(len(ends), [("order", "u1"), ("kind", "<u4"), ("points", "<u4"), ("xy", "<f8", (2, 2))])
     rows["order"], rows["kind"], rows["points"], rows["xy"] = _LITTLE_ENDIAN, _LINE_STRING, 2, ends
@@ -105,7 +105,7 @@ def _make_column(rows: NDArray[np.void]) -> pa.Array:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column: name (its suffix is the unit), Arrow type, unit, meaning, frame, whether null is allowed, flag bits."""
+    """Column: name (its suffix is the unit), Arrow type, unit, meaning, frame, whether null is allowed, flag bits."""
 
     name: str
     dtype: pa.DataType
@@ -160,7 +160,7 @@ class TableSchema:
         return replace(self, columns=tuple(column for column in self.columns if column.name in names))
 
     def check(self, table: pa.Table, *, more: bool = False) -> None:
-        """Raise `TableError` naming every column that is missing, extra (unless ``more`` is welcome), of a wrong type, or null in vain."""
+        """Raise `TableError` with all columns missing, extra (unless ``more``), of a wrong type, or wrongly null."""
         problems = list(self.find_problems(table, more=more))
         if problems:
             raise TableError(*problems)

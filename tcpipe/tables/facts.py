@@ -17,7 +17,7 @@ ABSENT: Mapping[str, tuple[object, ...]] = {"json": (None,)}
 
 @dataclass(frozen=True, slots=True)
 class TopicClock:
-    """Source of a topic's stamps and why, the median of header minus log time, and the correction of stamps by clock epoch [s]."""
+    """Source of a topic's stamps, its reason, median header minus log time, and correction by clock epoch [s]."""
 
     source: str
     why: str
@@ -51,8 +51,9 @@ class ClockStep:
 class PowerSign:
     """Sign of a drawn current and its source; whether the power source averages over its message period.
 
-    ``includes``: known loads besides the drives (computers, payload). ``gain_std_fraction`` and ``offset_std_amp`` are the σ of gain and
-    zero of a sensor of this kind, ``rest_current_amp`` the currents that a rail of it can have at rest, None where nothing is known.
+    ``includes``: known loads besides the drives (computers, payload). ``gain_std_fraction``, ``offset_std_amp``: σ of
+    gain and zero of a sensor of this kind. ``rest_current_amp``: possible currents of a rail of it at rest, None if
+    unknown.
     ``zero_amp``: zero of each current that the recipe states [A]. ``charging``: something charges the battery.
     """
 
@@ -74,7 +75,7 @@ class PowerSign:
 
 @dataclass(frozen=True, slots=True)
 class GateReset:
-    """A gate reset: rejected since ``start_ns``, accepted again at ``end_ns``, with an error of ``size`` [m] or [m/s]."""
+    """Gate reset: rejected since ``start_ns``, accepted again at ``end_ns``, with an error ``size`` [m] or [m/s]."""
 
     role: str
     start_ns: int
@@ -88,9 +89,9 @@ FIX_ERRORS = frozenset({"noise", "slow", "wander", "step"})
 
 @dataclass(frozen=True, slots=True)
 class ChangeFacts:
-    """A change that explains a contradiction: its kind (``varies`` or one of `tcpipe.stages.fuse_findings.CHANGES`), sensor and span.
+    """Change that explains a contradiction: kind (``varies`` or of `stages.fuse_findings.CHANGES`), sensor and span.
 
-    ``size`` is how large it is, in the unit of what changes; 0 where that is unknown.
+    ``size``: in the unit of the changed quantity; 0 if unknown.
     """
 
     kind: str
@@ -137,19 +138,19 @@ class StretchFacts:
     heading_from: str = ""
 
     def is_explained(self, max_rejected_fraction: float, max_change_count: float) -> bool:
-        """Return whether the estimate explains its sensors: it rejects few measurements of each, and needs few changes."""
+        """Return whether the estimate explains its sensors with few rejected measurements of each and few changes."""
         return self.count_changes() <= max_change_count and all(
             self.rejected[role] <= max_rejected_fraction * count for role, count in self.measurements.items()
         )
 
     def count_changes(self) -> int:
-        """Return the number of changes that explain the sensors, without `FIX_ERRORS`, which only make the position uncertain."""
+        """Return the number of changes that explain the sensors, without `FIX_ERRORS`, which only inflate σ."""
         return sum(each.kind not in FIX_ERRORS for each in self.changes)
 
 
 @dataclass(frozen=True, slots=True)
 class FuseFacts:
-    """All sections together, and each; ``set_aside`` counts by role and reason, ``skipped_s`` is time with too few measurements to fuse."""
+    """All sections, and each; ``set_aside``: counts by role, reason; ``skipped_s``: time with too few measurements."""
 
     rows: int
     sensors: tuple[str, ...]
@@ -175,9 +176,10 @@ class SensorChecks:
 
 @dataclass(frozen=True, slots=True)
 class ClockPair:
-    """Two sensors compared: by what, how late the first's stamps are against the second's, and how much one explains the other (0 to 1).
+    """Comparison of two sensors: method, delay of the first's stamps against the second's, explained share (0 to 1).
 
-    ``determined``: whether the offset is known well enough to be spoken of; ``from_middle_s``: when, from the middle of the run.
+    ``determined``: whether the offset is known well enough to report; ``from_middle_s``: its time, from the middle of
+    the run.
     """
 
     late: str
@@ -192,10 +194,10 @@ class ClockPair:
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """How late a sensor's stamps are against the reference's in the middle of the run, and their drift; 0 unless it is sure.
+    """Delay of a sensor's stamps against the reference in the middle of the run, and its drift; 0 if not certain.
 
-    ``noted``: whether a person should act on it; ``blamed``: the sensor is off, since two others agree against it; otherwise it and the
-    reference differ, and which of them is off is not known.
+    ``noted``: whether a person should act on it; ``blamed``: the sensor is off, since two others agree against it;
+    otherwise it and the reference differ, and it is unknown which of them is off.
     """
 
     offset_s: float
@@ -207,7 +209,7 @@ class ClockOffset:
 
 @dataclass(frozen=True, slots=True)
 class ClockFacts:
-    """The sensors' clocks in one clock epoch before offsets were taken out: all pairs, and offsets of those connected to the reference."""
+    """Sensor clocks in one clock epoch before correction: all pairs, and offsets of those linked to the reference."""
 
     clock_epoch: int
     reference: str
@@ -217,7 +219,7 @@ class ClockFacts:
 
 @dataclass(frozen=True, slots=True)
 class MaskFacts:
-    """Rows kept, dropped by reason, and in a gap by cause; the robot's maximum speed, and the least speed that counts as maximum."""
+    """Rows kept, masked by reason, and in a gap by cause; the robot's maximum speed, and the least that counts so."""
 
     rows: int
     rows_kept: int
@@ -265,7 +267,7 @@ class EnergyBudget:
 
 @dataclass(frozen=True, slots=True)
 class Floor:
-    """How well a label repeats itself, in the label's unit: the standard deviation of one pass, with its 95 % interval."""
+    """Repeatability of a label, in its unit: the standard deviation of one pass, with its 95 % interval."""
 
     pairs: int
     places: int
@@ -302,7 +304,7 @@ class HeldOut:
 
 @dataclass(frozen=True, slots=True)
 class PhysicsTerm:
-    """A coefficient of P = idle + drivetrain v / cos(s) + rolling v + grade v tan(s) + turning |yaw rate|, with its deviation."""
+    """Coefficient, with σ, of P = idle + drivetrain v / cos(s) + rolling v + grade v tan(s) + turning |yaw rate|."""
 
     term: str
     """``idle``, ``drivetrain`` (motors and gears, paid on any grade), ``rolling``, ``grade`` or ``turning``."""
@@ -351,7 +353,7 @@ class PhysicsFacts:
 
 @dataclass(frozen=True, slots=True)
 class Smoothing:
-    """Every value of the power is a mean from ``before_s`` before its stamp to ``after_s`` after it, beyond what the source states."""
+    """Power values are means from ``before_s`` before the stamp to ``after_s`` after it, besides the source's own."""
 
     before_s: float
     after_s: float
@@ -363,7 +365,7 @@ class Smoothing:
 
     @property
     def settles_s(self) -> float:
-        """How long after a stop values contain the motion before it [s]: a filter's output longer than the mean that is most like it."""
+        """Time after a stop for which values contain motion before it [s]: a filter's exceeds its equivalent mean's."""
         return 2.0 * self.before_s
 
     @property
@@ -374,11 +376,12 @@ class Smoothing:
 
 @dataclass(frozen=True, slots=True)
 class PowerSensorFacts:
-    """Uncertainty of the power sensor: σ of its gain and of the zero of a rail [A], with observations from the log (`tcpipe.power.audit`).
+    """Power sensor uncertainty: σ of its gain and of a rail's zero [A], and log observations (`tcpipe.power.audit`).
 
-    ``rest_amp``: lowest and highest current of a rail in halts; ``battery_ohm``: resistance of the battery by its sag [ohm]; the gain
-    changed by ``gain_ratio`` at ``gain_changed_ns``; ``lost_signs``: segments whose current flows back without a sign; ``smoothing``: None
-    if power is not smoothed; ``delay_s``: of power behind the motion, with its σ; None if motion does not determine it.
+    ``rest_amp``: lowest and highest current of a rail in halts; ``battery_ohm``: resistance of the battery by its sag
+    [ohm]; the gain changed by ``gain_ratio`` at ``gain_changed_ns``; ``lost_signs``: segments whose current flows back
+    without a sign; ``smoothing``: None if power is not smoothed; ``delay_s``: of power behind the motion, with its σ;
+    None if unobservable.
     """
 
     gain_std_fraction: float

@@ -1,9 +1,9 @@
 """Findings: observations in a log, a map or a run, as data, and verdicts, judged from findings alone.
 
-An error, a warning, the reason for a verdict and the cause of an exit code are all a `Finding`. Code that decides anything about a run
-reads findings; only the command line and the pages turn them into sentences.
+An error, a warning, the reason for a verdict and the cause of an exit code are all a `Finding`. Code that decides
+anything about a run reads findings; only the command line and the pages turn them into sentences.
 
-The catalogue of findings (``catalogue.toml``): what each code means, what to do about it, and the thresholds that decide it.
+Catalogue of findings (``catalogue.toml``): meaning and remedy of each code, and the thresholds that decide it.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ Affected: TypeAlias = Literal["position", "time", "energy"]
 WITNESSES_OF_LABEL = "label-witnesses"
 """Code of the findings that state what confirms a label; their subject is the label."""
 Witness: TypeAlias = Literal["wheel_odometry", "visual_odometry", "slope", "charge", "second_meter", "nothing"]
-"""Measurement that can confirm a label: an odometry next to GNSS (position, time); the power that slopes need, the fall of the battery's
-charge, or a second meter (energy)."""
+"""Measurement that can confirm a label: other odometry than GNSS (position, time); power needed by slopes, fall of the
+battery's charge, or a second meter (energy)."""
 NOTHING: Witness = "nothing"
 
 Action: TypeAlias = Literal["kept", "corrected", "inflated", "excluded", "rejected"]
@@ -41,8 +41,9 @@ class Entry:
     Attributes
     ----------
     title : what a reader searches for.
-    template : one line; ``{subject}``, ``{span}``, numbers (written with the unit of their suffix) and names of the finding.
-    severity : of an error, what it affects is not usable; of a warning, it is usable with care; a note changes no verdict.
+    template : one line; ``{subject}``, ``{span}``, numbers (written with the unit of their suffix) and names of the
+        finding.
+    severity : error: the affected labels are not usable; warning: usable with care; note: no change of the verdict.
     action : what tcpipe does with the subject by default.
     affects : labels that the finding makes doubtful.
     cause : why this happens.
@@ -94,7 +95,7 @@ def _read_text() -> str:
 
 @cache
 def read_catalogue_version() -> str:
-    """Return the first digits of the catalogue's hash: a verdict that was judged by another catalogue is judged again."""
+    """Return the first digits of the catalogue's hash; a verdict by another catalogue is judged again."""
     return sha256(_read_text().encode()).hexdigest()[:8]
 
 
@@ -117,8 +118,8 @@ def rank_severity(severity: Severity) -> int:
 F = TypeVar("F")
 
 SubjectKind: TypeAlias = Literal[
-    "role", "topic", "frame", "layer", "run", "class", "slope", "file", "log", "map", "dataset", "column", "tag", "call", "model", "robot",
-    "split", "label",
+    "role", "topic", "frame", "layer", "run", "class", "slope", "file", "log", "map", "dataset", "column", "tag",
+    "call", "model", "robot", "split", "label",
 ]  # fmt: skip
 
 LEFT_OUT: Mapping[str, tuple[object, ...]] = {"json": (None, {}, [], ())}
@@ -183,7 +184,7 @@ def make_finding(
 ) -> Finding:
     """Return a finding that the catalogue knows, with the catalogue's severity and action unless they are given.
 
-    `ValueError` is a bug: the catalogue lacks the code or a remedy, or the template needs a number or a name that is missing.
+    `ValueError` is a bug: the catalogue lacks the code or a remedy, or a number or name of the template is missing.
     """
     entry = read_catalogue().get(code)
     if entry is None:
@@ -245,8 +246,8 @@ _GRADE_OF: Mapping[Severity, Grade] = {"error": "not usable", "warning": "usable
 class Verdict:
     """A grade each for position, time and energy, and the findings that decided, the worst first.
 
-    ``confirmed_by`` names the witnesses of each label that was compared with any, ``nothing`` where none was found; ``labels`` are the
-    findings with size, σ and witnesses of each label.
+    ``confirmed_by``: witnesses of each compared label, ``nothing`` if none was found; ``labels``: findings with size, σ
+    and witnesses of each label.
     """
 
     position: Grade = "usable"
@@ -269,7 +270,7 @@ class Verdict:
 
 
 def judge(findings: Iterable[Finding]) -> Verdict:
-    """Return the verdict: each label has the grade of its worst finding; without a witness it is usable with care at best."""
+    """Return the verdict: the grade of each label's worst finding; without a witness at best usable with care."""
     findings = tuple(findings)
     decisive = (finding for finding in findings if finding.severity != "note" and find_entry(finding.code).affects)
     reasons = tuple(sort_findings(decisive))

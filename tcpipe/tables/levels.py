@@ -1,7 +1,8 @@
 """The levels of data L1 to L6 (ARCHITECTURE.md): the schema of every table, and the types that stages exchange.
 
 A level is checked when it is created: an invalid Track cannot exist, and one error names every wrong column.
-Frames follow REP-103 and REP-105: base_link is x forward, y left, z up; the track's plane is east, north, up of its datum.
+Frames follow REP-103 and REP-105: base_link is x forward, y left, z up; the track's plane is east, north, up of its ENU
+origin.
 """
 
 from __future__ import annotations
@@ -212,7 +213,8 @@ _TRACK_COLUMNS = (
         _make_nullable(
             f"displacement_std_{name}_m",
             "m",
-            f"standard deviation of the horizontal displacement over the next {name}, along it, including the correlation of both ends; "
+            f"standard deviation of the horizontal displacement over the next {name}, along it, "
+            "including the correlation of both ends; "
             "null where the track does not go on, and without a smoother",
             "enu",
         )
@@ -302,7 +304,10 @@ MOTION_COLUMNS = tuple(
         (
             "slip_std_fraction",
             "1",
-            "standard deviation of slip_fraction from the speed over ground: it excludes a wrong wheel radius, which counts as slip",
+            (
+                "standard deviation of slip_fraction from the speed over ground: "
+                "it excludes a wrong wheel radius, which counts as slip"
+            ),
             "base_link",
         ),
         (
@@ -468,7 +473,7 @@ REJECTIONS = TableSchema(
 class Sensor:
     """The topic of a stream and the extrinsics of its sensor.
 
-    ``xyz_m`` and ``quat_xyzw`` are base_link_from_sensor (position of the sensor in base_link; rotation sensor to base_link).
+    ``xyz_m``, ``quat_xyzw``: base_link_from_sensor (position of the sensor in base_link; rotation sensor to base_link).
     """
 
     topic: str
@@ -478,7 +483,7 @@ class Sensor:
     xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quat_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     placed_by: str = "assumed"
-    """``tf_static``, ``recipe``, ``same frame`` (the message is already in base_link), ``assumed``, or ``not needed`` (power, command)."""
+    """``tf_static``, ``recipe``, ``same frame`` (already base_link), ``assumed``, ``not needed`` (power, command)."""
     time_source: str = "header"
     """Source of the stamps: ``header`` or ``log``."""
 
@@ -559,7 +564,7 @@ class MaskedTrack(_Level):
 
 @dataclass(frozen=True, slots=True)
 class Segments(_Level):
-    """L4: cut segments and where every metre of the track went (``distance_by_reason_m``: kept, then each loss by name)."""
+    """L4: cut segments, and every metre of the track by reason (``distance_by_reason_m``: kept, then each loss)."""
 
     schema: ClassVar[TableSchema] = SEGMENTS
     distance_by_reason_m: Mapping[str, float]

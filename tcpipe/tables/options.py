@@ -1,4 +1,4 @@
-"""The options of a command, declared once: fields of a frozen dataclass that click's options and the public function are made of.
+"""Options of a command: fields of a frozen dataclass from which click's options and the public function are made.
 
 The modules that declare options import neither numpy nor pyarrow, so that ``--help`` starts fast.
 """
@@ -87,7 +87,7 @@ def tags(about: str) -> Any:
 
 
 def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R]:
-    """Return the public function of a command: its keywords are the fields of the options, and ``run`` does the work."""
+    """Return the public function of a command: keywords are the fields of the options, and ``run`` does the work."""
     name = run.__name__.removeprefix("run_")
     shown = {entry.name: entry.metadata.get("option", Option()) for entry in fields(options)}  # type: ignore[arg-type]
     words = {flag.strip("-"): keyword for keyword, option in shown.items() for flag in (keyword, *option.flags)}
@@ -105,7 +105,8 @@ def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R
     call.__name__ = call.__qualname__ = name
     call.__module__ = run.__module__
     call.__doc__ = "\n".join([cleandoc(run.__doc__ or ""), "", "Parameters", "----------", *lines, "", more])
-    call.__signature__ = signature(options).replace(return_annotation=signature(run).return_annotation)  # type: ignore[attr-defined]
+    called = signature(options).replace(return_annotation=signature(run).return_annotation)
+    call.__signature__ = called  # type: ignore[attr-defined]
     return call
 
 

@@ -1,4 +1,4 @@
-"""Layers of maps and patches as data: what is interpolated and how, what is stored, and what becomes of it in the tensor (section IV-B).
+"""Layers of maps and patches: interpolation, storage and tensor channels of each (section IV-B).
 
 ============  ==============  ============================  =======================================
 kind          taken from map  in a patch                    in the tensor
@@ -9,9 +9,9 @@ relative      bilinear        steps above the patch's       the same, in its ran
                               smallest
 ============  ==============  ============================  =======================================
 
-The paper has one of each: ortho O / 255, terrain (C - 1) / (c - 1), height (H - min H) / 1 m, all clipped to [0, 1]. A user's own rasters
-are continuous or categorical (docs/how-to/your-maps.md). A pixel without data in any layer is 0 in every channel; only a recipe with
-``min_valid_fraction`` below 1 keeps such pixels.
+The paper has one of each: ortho O / 255, terrain (C - 1) / (c - 1), height (H - min H) / 1 m, all clipped to [0, 1]. A
+user's own rasters are continuous or categorical (docs/how-to/your-maps.md). A pixel without data in any layer is 0 in
+every channel; only a recipe with ``min_valid_fraction`` below 1 keeps such pixels.
 """
 
 from __future__ import annotations
@@ -111,16 +111,17 @@ def name_key(name: str) -> str:
 
 
 def find_named_scheme(name_by_value: Mapping[int, str], table: ClassTable) -> ClassScheme | None:
-    """Return the scheme in which a raster's own names say what its values are; None if none of them is a name of the table."""
+    """Return the scheme of a raster that names its values; None if no name is in the table."""
     by_name = {name_key(entry.name): entry.id for entry in table.classes}
     found = {value: by_name[name_key(name)] for value, name in name_by_value.items() if name_key(name) in by_name}
     return ClassScheme(table, found) if found else None
 
 
 def make_own_scheme(name_by_value: Mapping[int, str]) -> ClassScheme | None:
-    """Return classes as a raster itself names them, all traversable; None where it names none, or more than there are ids.
+    """Return the classes that a raster names, all traversable; None without names, or with more than there are ids.
 
-    A class's id is its value where all values can be ids, else its place in the order of the values; values of one name are one class.
+    A class's id is its value if all values can be ids, else its place in the order of values; values of one name are
+    one class.
     """
     first = {name: value for value, name in sorted(name_by_value.items(), reverse=True)}
     values = sorted(first.values())
@@ -278,7 +279,8 @@ PAPER_LAYERS: dict[str, Layer] = {
     ),
     **{name: replace(_ORTHO, name=name, long_name=f"orthophoto, {name[6:]}") for name in COLOURS},
 }
-"""Layers that a map may have by their names alone; those of a user are made by `make_continuous_layer` and `make_categorical_layer`."""
+"""Layers that a map may have by their names alone; `make_continuous_layer` and `make_categorical_layer` make those of a
+user."""
 
 
 def make_continuous_layer(name: str, *, unit: str, low: float, high: float) -> Layer:

@@ -1,7 +1,8 @@
 """Coordinate reference systems (CRS) of maps: tests for metric axes, and projection of points.
 
-A map's CRS is right-handed, and its unit is within one per cent of a metre on the ellipsoid: a UTM zone or a national grid, but not
-degrees, feet or Web Mercator. A CRS without an authority's code keeps the datum shift that its file states (TOWGS84) as a bound CRS.
+A map's CRS is right-handed, and its unit is within 1 % of a metre on the ellipsoid: a UTM zone or a national grid, but
+not degrees, feet or Web Mercator. A CRS without an authority's code keeps the datum shift of its file (TOWGS84) as a
+bound CRS.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _EARTH_RADIUS_M = 6_371_000.0
 
 
 def parse_crs(text: str, *, where: str) -> CRS:
-    """Return the horizontal part of a CRS given as ``EPSG:n`` or WKT, with its datum shift; `MapError` names ``where`` it was given."""
+    """Return the horizontal CRS of ``EPSG:n`` or WKT, with its datum shift; `MapError` names its source ``where``."""
     try:
         crs = CRS.from_user_input(text)
     except CRSError as error:
@@ -42,7 +43,8 @@ def parse_crs(text: str, *, where: str) -> CRS:
     crs = crs.to_2d()
     if crs.geodetic_crs is None or not (crs.is_projected or crs.is_geographic):
         raise MapError(
-            f"{where}: the CRS {crs.name!r} is local, expected a projected or geographic one; if you know which, give --crs EPSG:n"
+            f"{where}: the CRS {crs.name!r} is local, expected a projected or geographic one; "
+            "if you know which, give --crs EPSG:n"
         )
     radius_m = _read_ellipsoid(crs)[0]
     if abs(radius_m / _EARTH_RADIUS_M - 1.0) > 0.02:
@@ -56,13 +58,14 @@ def parse_crs(text: str, *, where: str) -> CRS:
 
 
 def _bind_shift(crs: CRS, bound: CRS, where: str) -> CRS:
-    """Return a CRS with the datum shift of a bound one, without it if the shift is zero; `MapError` for a shift in a grid file."""
+    """Return a CRS with the datum shift of a bound one, without it if zero; `MapError` for a shift in a grid file."""
     shift = bound.coordinate_operation
     assert shift is not None  # noqa: S101  (a bound CRS has one)
     grids = {grid.short_name for grid in shift.grids}
     if grids - {"@null"}:
         raise MapError(
-            f"{where}: the datum shift of its CRS is in the grid file {', '.join(grids)!r}, which tcpipe does not open; "
+            f"{where}: the datum shift of its CRS is in the grid file {', '.join(grids)!r}, "
+            "which tcpipe does not open; "
             "transform the raster: rio warp in.tif out.tif --dst-crs EPSG:n"
         )
     is_zero = bool(shift.towgs84) and not any(shift.towgs84)
@@ -117,7 +120,7 @@ def is_metric(crs: CRS, xy: Floats) -> bool:
 
 
 def find_utm_crs(crs: CRS, xy: tuple[float, float]) -> CRS:
-    """Return the UTM zone of a point of another CRS, on its datum if that has UTM zones and no shift of its own, else on WGS 84."""
+    """Return the UTM zone of a point, on its CRS's datum if that has UTM zones and no own shift, else on WGS 84."""
     geodetic = CRS(crs.geodetic_crs)
     lon, lat = Transformer.from_crs(crs, geodetic, always_xy=True).transform(*xy)
     if not (math.isfinite(lon) and math.isfinite(lat)):
@@ -132,7 +135,7 @@ def find_utm_crs(crs: CRS, xy: tuple[float, float]) -> CRS:
 
 @dataclass(frozen=True)
 class Projection:
-    """The one operation that takes points from one CRS to another over one area, so that neighbours are never taken differently.
+    """Operation from one CRS to another over one area: one for all its points, so that neighbours transform alike.
 
     ``area_deg`` is west, south, east, north. Axes are always x (longitude, east) first.
     """
@@ -167,7 +170,7 @@ class Projection:
         return np.stack([np.asarray(x, np.float64), np.asarray(y, np.float64)], axis=-1)
 
     def find_rough_shift(self, subject: Subject) -> tuple[Finding, ...]:
-        """Return the finding, if any, that the two datums differ and their shift is rough, unknown or stated by a file."""
+        """Return a finding if the two datums differ and their shift is rough, unknown or given by a file."""
         source, target = (CRS(crs.geodetic_crs) for crs in (self.source, self.target))
         if source.datum == target.datum:
             return ()

@@ -1,10 +1,11 @@
-"""Registration of a map to a track by the heights of the ground under it: the horizontal shift, and the unit of the map's heights.
+"""Registration of a map to a track by ground heights: the horizontal shift, and the unit of the map's heights.
 
-Heights of track and map differ by a constant and by the shape of the ground. The shift at which the shapes agree best is searched on a
-lattice (terrain-aided navigation, Hollowell 1990; Nuth & Kääb 2011) and refined by a paraboloid through the squared misfits. A tilt of the
-map and a drift of the track's heights, which look like a shift on a smooth hill, are fitted with it. The shift's standard deviation is the
-scatter of the best shift among random draws of blocks of the path (block bootstrap, Künsch 1989), since errors of GNSS are correlated over
-seconds, and those of the map over metres. A shift along which the ground does not vary, or repeats itself, is unobservable and stays zero.
+Heights of track and map differ by a constant and by the shape of the ground. The shift at which the shapes agree best
+is searched on a lattice (terrain-aided navigation, Hollowell 1990; Nuth & Kääb 2011) and refined by a paraboloid
+through the squared misfits. A tilt of the map and a drift of the track's heights, which look like a shift on a smooth
+hill, are fitted with it. The shift's standard deviation is the scatter of the best shift among random draws of blocks
+of the path (block bootstrap, Künsch 1989), since errors of GNSS are correlated over seconds, and those of the map over
+metres. A shift along which the ground does not vary, or repeats itself, is unobservable and stays zero.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from tcpipe.terrain.sampling_kernel import compute_morton
 from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_tile_window
 
 REACH_M, KNOWN_M = 4.0, 0.25
-"""Shifts are searched this far each way; a direction is not determined if the shift's standard deviation along it is larger [m]."""
+"""Range of shifts each way [m]; largest standard deviation of a shift along a determined direction [m]."""
 _STEP_M, _NEAR = 0.25, 2
 """Step of the lattice of shifts [m], and steps each way from the best shift through which the paraboloid is fitted."""
 _SHIFT_M = np.arange(-round(REACH_M / _STEP_M), round(REACH_M / _STEP_M) + 1) * _STEP_M
@@ -33,7 +34,7 @@ _MIDDLE = len(_SHIFT_M) // 2, len(_SHIFT_M) // 2
 
 
 def _expand_square(east_m: Floats, north_m: Floats) -> Floats:
-    """Return the terms by which value, gradient and curvature of a paraboloid enter its value at places (N,), shape (N, 6)."""
+    """Return a paraboloid's terms (1, gradient, curvature) at places (N,), shape (N, 6)."""
     squares = east_m**2 / 2.0, east_m * north_m, north_m**2 / 2.0
     return np.stack([np.ones_like(east_m), east_m, north_m, *squares], axis=-1)
 
@@ -42,13 +43,16 @@ _PARABOLOID = np.linalg.pinv(
     _expand_square(*(np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, -1)[::-1] * _STEP_M))
 )
 _SPACING_M, _DRIFT_M, _CLIFF_M = 0.5, 25.0, 1.0
-"""Spacing of points; path over which the track's heights have one error; relief among near shifts that no robot drives on [m]."""
+"""Spacing of points [m]; path over which the track's heights have one error [m]; relief among near shifts that no robot
+drives on [m]."""
 _FEWEST_POINTS, _MOST_POINTS = 60, 1_200
 """Fewest and most points of a track."""
 _BLOCKS, _DRAWS, _FEW_BLOCKS = 12, 200, 1.38
-"""Blocks of the path, draws of them, and factor of a variance by so few: 12 / 11, and the squared ratio of Student's t and normal."""
+"""Blocks of the path, draws of them, and variance factor for few blocks: 12 / 11 times the squared ratio of Student's t
+to normal."""
 _SIGMAS, _OUTLIER, _EDGE_M = 5.0, 3.5, 0.75 * _STEP_M
-"""Standard deviations by which a shift lowers the misfit, and of an outlier; least step from the best inner shift beyond the edge [m]."""
+"""Least decrease of the misfit by a shift [σ]; least outlier [σ]; least step from the best inner shift beyond the edge
+[m]."""
 _CHI2_999 = 13.82
 """99.9 % of χ² with two degrees of freedom."""
 _LEAST_GAIN = -2.0 * np.log(0.9)
@@ -59,12 +63,13 @@ _UNITS |= {1.0 / metres: "m" for metres in _UNITS}
 """Unit of a map's heights by their scale; metres that were converted from another unit by mistake have its inverse."""
 _MAX_UNIT_ERROR = 0.07
 _KNOWN_SCALE, _EXPLAINED, _MAX_WRONG_STD, _MIN_WRONG_EXPLAINED = 0.03, 0.9, 0.1, 0.7
-"""Relative standard deviation and explained share from which a scale is compared with one, and from which one far from it is certain."""
+"""Largest relative σ and least explained share of a scale to compare with 1; the same two for a scale that is surely
+wrong."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeightScale:
-    """Metres that a track rises where the map rises by one, its standard deviation, and the explained share of the track's variance."""
+    """Metres that a track rises per metre on the map, its σ, and the explained share of the track's variance."""
 
     value: float
     std: float
@@ -76,7 +81,7 @@ class HeightScale:
         return self.std < _KNOWN_SCALE * max(self.value, 1.0) and self.explained > _EXPLAINED
 
     def is_wrong(self) -> bool:
-        """Return whether the map's heights are in another unit, or scaled: noise of the map lowers the value to ``explained`` at most."""
+        """Return whether the map's heights are scaled or in another unit; map noise lowers `value` to ``explained``."""
         if self.std > _MAX_WRONG_STD * self.value or self.explained < _MIN_WRONG_EXPLAINED:
             return False
         most, margin = read_threshold("map-height-scale", "max_factor"), 3.0 * self.std
@@ -95,13 +100,13 @@ class HeightScale:
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Shift of a map against a track, and what is left.
+    """Shift of a map against a track, and the remaining misfit.
 
-    ``shift_xy_m`` is what to add to the track's positions to find their ground on the map [m, the map's axes], along determined
-    directions only. ``height_offset_m`` is track minus map. ``misfit_m`` and ``shifted_misfit_m`` are standard deviations of what is left
-    without and with the shift, ``shape_misfit_m`` of what is left with the shift, a tilt and a drift. ``significant``: the shift is not
-    chance. ``at_reach``: the true shift may be beyond the lattice. ``scale`` is of heights. ``covariance`` is that of the shift, (2, 2)
-    [m²]; its variance is ``REACH_M**2`` along directions that are not determined.
+    ``shift_xy_m``: correction of the track's positions to their ground on the map [m, the map's axes], along determined
+    directions only. ``height_offset_m``: track minus map. ``misfit_m``, ``shifted_misfit_m``: standard deviations of
+    the misfit without and with the shift, ``shape_misfit_m`` with the shift, a tilt and a drift. ``significant``: the
+    shift is not chance. ``at_reach``: the true shift may be beyond the lattice. ``scale``: of heights. ``covariance``:
+    of the shift, (2, 2) [m²]; its variance is ``REACH_M**2`` along directions that are not determined.
     """
 
     points: int
@@ -146,7 +151,8 @@ def register_track(source: MapReader, xy_m: Floats, height_m: Floats) -> Registr
     Parameters
     ----------
     source : the map.
-    xy_m : positions in the map's CRS, in the order driven, shape (N, 2) [m]; positions that are not finite or not on the map are skipped.
+    xy_m : positions in the map's CRS, in driving order, shape (N, 2) [m]; positions not finite or outside the map are
+        skipped.
     height_m : their heights above any surface, shape (N,) [m].
     """
     level, (xy_m, height_m) = choose_level(source, _STEP_M), _thin_track(xy_m, height_m)
@@ -176,7 +182,7 @@ def _thin_track(xy_m: Floats, height_m: Floats) -> tuple[Floats, Floats]:
 
 
 def _sample_heights(level: MapReader, xy_m: Floats) -> Floats:
-    """Return the map's heights at every point moved by every pair of shifts (north, east), shape (N, K, K); NaN without data."""
+    """Return map heights at every point and pair of shifts (north, east), shape (N, K, K); NaN without data."""
     px, offset_px = level.grid.px_from_xy(xy_m), _SHIFT_M / level.grid.pixel_size_m
     reach_px, found = int(np.ceil(offset_px[-1])) + 2, np.empty((len(xy_m), *2 * _SHIFT_M.shape))
     for group in group_by_tile(px, level):
@@ -190,7 +196,7 @@ def _sample_heights(level: MapReader, xy_m: Floats) -> Floats:
 
 
 def _find_ground(excess_m: Floats, xy_m: Floats) -> tuple[Mask, Mask]:
-    """Return the points on the map's ground at the shift that fits best, (N,), and those of them that determine a shift.
+    """Return the points on the map's ground at the best shift, (N,), and those of them that determine a shift.
 
     These are not on cliffs, unless too few are left.
     """
@@ -212,7 +218,7 @@ def _find_ground(excess_m: Floats, xy_m: Floats) -> tuple[Mask, Mask]:
 
 
 def _fit_tilt(xy_m: Floats, excess_m: Floats) -> Floats:
-    """Return the tilt of the plane that leaves the least absolute excess, shape (N,) [m]: a bridge or a tree does not turn it."""
+    """Return the tilt of the plane of least absolute excess, shape (N,) [m], robust against bridges and trees."""
     off_m, columns = excess_m - np.median(excess_m), np.column_stack([xy_m - xy_m.mean(axis=0), np.ones(len(xy_m))])
     plane = least_squares(lambda plane: columns @ plane - off_m, np.zeros(3), loss="soft_l1", f_scale=0.01).x
     return np.asarray(columns[:, :2] @ plane[:2])
@@ -225,7 +231,7 @@ def _find_least(spread: Floats) -> tuple[int, int]:
 
 
 def _flatten(excess_m: Floats, xy_m: Floats) -> tuple[Floats, Floats, Ints]:
-    """Return the excess without tilt and drift, constant in each stretch of path; the columns of a tilt, (N, 2); each point's block."""
+    """Return the excess without tilt and piecewise constant drift; the tilt's columns, (N, 2); each point's block."""
     path_m = np.cumsum(np.hypot(*np.diff(xy_m, axis=0, prepend=xy_m[:1]).T))
     count = max(_BLOCKS, round(float(path_m[-1]) / _DRIFT_M))
     place = np.minimum(path_m * count // path_m[-1], count - 1)
@@ -238,13 +244,13 @@ def _flatten(excess_m: Floats, xy_m: Floats) -> tuple[Floats, Floats, Ints]:
 
 
 def _remove_tilt(values: Floats, tilt: Floats) -> Floats:
-    """Return values, shape (N, ...), less the least-squares multiples of a tilt's columns, (N, 2), whose means are zero."""
+    """Return values, shape (N, ...), less their least-squares fit by a tilt's columns, (N, 2), of mean zero."""
     flat = values.reshape(len(values), -1)
     return np.asarray((flat - tilt @ (np.linalg.pinv(tilt) @ flat)).reshape(values.shape))
 
 
 def _fit_height_scale(ground_m: Floats, height_m: Floats, xy_m: Floats) -> HeightScale:
-    """Return the scale of heights, fitted with a tilt of the map unless it is that of a known unit: no map is tilted so much."""
+    """Return the scale of heights, fitted with a tilt of the map unless the scale is that of a known unit."""
     whole, tilt = _regress_heights(ground_m, height_m), xy_m - xy_m.mean(axis=0)
     if whole.is_wrong() and whole.find_unit():
         return whole
@@ -252,7 +258,7 @@ def _fit_height_scale(ground_m: Floats, height_m: Floats, xy_m: Floats) -> Heigh
 
 
 def _regress_heights(ground_m: Floats, height_m: Floats) -> HeightScale:
-    """Return the regression of the track's heights (N,) on the map's (N, K, K) at the shift where both are most alike."""
+    """Return the regression of the track's heights, (N,), on the map's, (N, K, K), at the shift of best correlation."""
     ground, height = ground_m - ground_m.mean(axis=0), height_m - height_m.mean()
     squares, products = np.einsum("nij,nij->ij", ground, ground), np.einsum("nij,n->ij", ground, height)
     explained = np.maximum(products, 0.0) ** 2 / (squares * (height @ height) + _RIDGE)
@@ -298,7 +304,7 @@ def _refine_shift(near_m: Floats, good_m: Floats, xy_m: Floats, scale: HeightSca
 
 
 def _resample_squares(flat_m: Floats, tilt: Floats, block: Ints) -> Floats:
-    """Return the squared misfits of all points, and of blocks drawn at random, shape (1 + draws, K, K), each without tilt."""
+    """Return squared misfits of all points and of random blocks, shape (1 + draws, K, K), each without tilt."""
     flat, count = flat_m.reshape(len(flat_m), -1), int(block.max()) + 1
     drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), _DRAWS)
     weights, blocks = np.vstack((np.ones((1, count)), drawn)), [block == number for number in range(count)]
@@ -311,7 +317,7 @@ def _resample_squares(flat_m: Floats, tilt: Floats, block: Ints) -> Floats:
 
 
 def _fit_paraboloids(misfits: Floats, at: Ints | None = None) -> tuple[Ints, Floats]:
-    """Return the indices (north, east) of the least of each misfit, (R, 2), and the paraboloid around it, (R, 6), as `_expand_square`."""
+    """Return each misfit's minimum (north, east), (R, 2), and the paraboloid around it, (R, 6), as `_expand_square`."""
     near = sliding_window_view(misfits, (2 * _NEAR + 1,) * 2, axis=(1, 2))
     if at is None:
         inner = near[:, :, :, _NEAR, _NEAR]

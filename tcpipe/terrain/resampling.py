@@ -1,12 +1,12 @@
 """Resampling a raster onto a map's grid, and a map's coarser levels.
 
-A raster as coarse as the grid or coarser is interpolated bilinearly, a finer one averaged (classes: nearest or majority). A bilinear tap
-or a part of a mean without data leaves the pixel without data. A tap of weight zero does not count, so a raster on the grid passes
-unchanged. The kernels take a *lattice* of positions: source pixel coordinates (centres are integers) of every 16th pixel of the
-grid, beginning one step outside; they interpolate positions between.
+A raster as coarse as the grid or coarser is interpolated bilinearly, a finer one averaged (classes: nearest or
+majority). A bilinear tap or a part of a mean without data leaves the pixel without data. A tap of weight zero does not
+count, so a raster on the grid passes unchanged. The kernels take a *lattice* of positions: source pixel coordinates
+(centres are integers) of every 16th pixel of the grid, beginning one step outside; they interpolate positions between.
 
-A pixel of a level spans ``factor`` x ``factor`` map pixels: their mean, or their commonest class (ties go to the lower id; no data votes).
-A patch takes the coarsest level that is not coarser than its own pixels.
+A pixel of a level spans ``factor`` x ``factor`` map pixels: their mean, or their commonest class (on a tie the lower
+id; no data counts as a class). A patch takes the coarsest level that is not coarser than its own pixels.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def _position(lattice: Floats, row: float, col: float) -> tuple[float, float]:
 
 @compile_kernel
 def resample_bilinear(source: Floats, lattice: Floats, out: Floats) -> None:
-    """Interpolate ``source`` (NaN: no data), shape (H, W), at every pixel of ``out``; NaN where a tap has no data or lies outside."""
+    """Interpolate ``source`` (NaN: no data), shape (H, W), at each pixel of ``out``; NaN if a tap is outside or NaN."""
     rows, cols = source.shape
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -64,7 +64,7 @@ def resample_bilinear(source: Floats, lattice: Floats, out: Floats) -> None:
 
 @compile_kernel
 def mean(source: Floats, lattice: Floats, parts: int, out: Floats) -> None:
-    """Average ``source`` (NaN: no data) over every pixel of ``out``, taken at parts x parts points; NaN where any has no data."""
+    """Average ``source`` (NaN: no data) over each pixel of ``out`` at parts x parts points; NaN if any has no data."""
     rows, cols = source.shape
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -87,7 +87,7 @@ def _vote(votes: Ints, found: int, best: int) -> int:
 
 @compile_kernel
 def resample_majority(source: Bytes, lattice: Floats, parts: int, out: Bytes) -> None:
-    """Take the commonest class over every pixel of ``out`` at parts x parts points (1: nearest); 0 is no data and votes; ties go low."""
+    """Write each pixel's commonest class at parts x parts points (1: nearest); 0 (no data) counts; ties go low."""
     rows, cols = source.shape
     votes = np.zeros(256, np.int64)
     for i in range(out.shape[0]):
@@ -108,7 +108,7 @@ def resample_majority(source: Bytes, lattice: Floats, parts: int, out: Bytes) ->
 
 @compile_kernel
 def reduce_majority(ids: Bytes, factor: int, out: Bytes) -> None:
-    """Take the commonest class of every whole ``factor`` x ``factor`` block of ``ids``; 0 is no data and votes; ties go low."""
+    """Write the commonest class of each ``factor`` x ``factor`` block of ``ids``; 0 (no data) counts; ties go low."""
     votes = np.zeros(256, np.int64)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -130,14 +130,14 @@ _SLACK = 1.01
 
 
 def list_factors(grid: MapGrid) -> tuple[int, ...]:
-    """Return the factors of a map's levels, rising: 1, 2, 4 … while pixels stay below `COARSEST_M` and two remain each way."""
+    """Return the factors of a map's levels: 1, 2, 4 … with pixels below `COARSEST_M` and at least two each way."""
     powers = range(1, _WIDEST_FACTOR.bit_length())
     fits = (2**n for n in powers if 2**n * grid.pixel_size_m <= COARSEST_M and min(grid.rows, grid.cols) >> n >= 2)
     return (1, *fits)
 
 
 def make_overview_grid(grid: MapGrid, factor: int) -> MapGrid:
-    """Return the grid of a level: the same corner, wider pixels; what does not fill one at the far edges is left out."""
+    """Return the grid of a level: same corner, wider pixels, without incomplete pixels at the far edges."""
     return replace(grid, pixel_size_m=grid.pixel_size_m * factor, rows=grid.rows // factor, cols=grid.cols // factor)
 
 

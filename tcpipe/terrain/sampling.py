@@ -1,13 +1,15 @@
-"""Sampling many patches, or classes at points, from one map: along a space-filling curve, tile by tile, in bounded memory.
+"""Sampling of many patches, or classes at points, along a space-filling curve, tile by tile, in bounded memory.
 
-Patch geometry: which point of the map each pixel of a patch shows (paper section IV-B; docs/explanation/rulings.md, Patch).
+Patch geometry: the map point of each pixel of a patch (paper section IV-B; docs/explanation/rulings.md, Patch).
 
-A patch is a square on the ground, turned so that its columns run along the segment. Where its side equals the chord, the
-segment's start is the middle of its rear edge (column 0) and the end the middle of its front edge; otherwise it is centred on the
-chord's midpoint. Row 0 is the left of travel. Pixel (r, c) is centred at ((c + ½)·pitch, patch/2 - (r + ½)·pitch) along and left.
+A patch is a square on the ground, turned so that its columns run along the segment. If its side equals the chord, the
+segment's start is the middle of its rear edge (column 0) and the end the middle of its front edge; otherwise it is
+centred on the chord's midpoint. Row 0 is left of travel. Pixel (r, c) is centred at ((c + ½)·pitch, patch/2 - (r +
+½)·pitch) along and left.
 
-The axes are taken in the map's CRS from the projected end points, so grid convergence needs no correction; and a metre of the
-patch is a metre of *ground*: the projected chord over ``chord_m`` is the map's scale there (1 ± 1e-3), and the patch takes it on.
+The axes are those of the projected end points in the map's CRS, so grid convergence needs no correction. A metre of the
+patch is a metre of *ground*: the projected chord over ``chord_m`` is the map's scale there (1 ± 1e-3), and scales the
+patch.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_til
 
 
 def compute_relief_m(height: NDArray[np.uint16]) -> Floats:
-    """Return the largest difference of the stored heights of patches, shape (N, px, px), without data left out [m], shape (N,)."""
+    """Return the relief of patches, shape (N, px, px): largest difference of valid heights [m], shape (N,)."""
     steps = np.where(height == HEIGHT_NODATA, np.uint16(0), height).max(axis=(1, 2), initial=np.uint16(0))
     return np.asarray(steps * HEIGHT_STEP_M)
 
@@ -43,10 +45,10 @@ _MOVED_ROWS = 128
 class Patches:
     """N sampled patches.
 
-    ``pixels`` are the layers that the map has, by name, (N, S, S), as `tcpipe.terrain.layers` says. The other arrays have shape (N,):
-    smallest height [m], slopes of the fitted plane [rad], valid share, share clipped by the tensor, majority class of terrain under the
-    chord (0: none) and its share. ``profile_m``: heights in the middle of rear edge, patch and front edge above the smallest [m], NaN
-    without data, (N, 3).
+    ``pixels``: the map's layers by name, (N, S, S), as `tcpipe.terrain.layers` defines. The other arrays have shape
+    (N,): smallest height [m], slopes of the fitted plane [rad], valid share, share clipped by the tensor, majority
+    class of terrain under the chord (0: none) and its share. ``profile_m``: heights in the middle of rear edge, patch
+    and front edge above the smallest [m], NaN without data, (N, 3).
     """
 
     pixels: Mapping[str, NDArray[Any]]
@@ -64,7 +66,7 @@ class Patches:
         return {entry.name: getattr(self, entry.name) for entry in fields(self)[1:]}
 
     def keep_valid(self, good: Mask) -> Patches:
-        """Return the good patches, in their order; their pixels move in place, so do not use these patches afterwards."""
+        """Return the good patches in order; their pixels move in place, so do not use these patches afterwards."""
         rising = np.flatnonzero(good)
         for layer, first in product(self.pixels.values(), range(0, len(rising), _MOVED_ROWS)):
             here = rising[first : first + _MOVED_ROWS]
@@ -99,7 +101,8 @@ def sample_patches(
     frames : where the patches lie, in the map's CRS.
     chord_m : length of each segment on the ground [m], shape (N,).
     patch_m, patch_px : side of a patch on the ground [m], and in pixels.
-    pool : tiles of the level `choose_level` the patches' pitch, to go on with from call to call; None holds them for this call alone.
+    pool : tiles of the level that `choose_level` returns for the patches' pixel size, kept between calls; None keeps
+        none.
     """
     level = choose_level(source, patch_m / patch_px)
     pixels = map_px_from_patch(frames, level.grid, patch_m=patch_m, patch_px=patch_px)
@@ -138,7 +141,7 @@ def _compute_profile(height: NDArray[np.uint16]) -> Floats:
 
 
 def _compute_boxes(pixels: Floats, patch_px: int, chords: Floats, points: int) -> Ints:
-    """Return the map pixels that each patch and its chord touch: first row and column, last row and column (exclusive), (N, 4)."""
+    """Return the map pixels of each patch and its chord: first row and column, last (exclusive), shape (N, 4)."""
     first, along, down = pixels[:, :2], pixels[:, 2:4] * (patch_px - 1), pixels[:, 4:6] * (patch_px - 1)
     begin, end = chords[:, :2], chords[:, :2] + chords[:, 2:] * (points - 1)
     touched = np.stack([first, first + along, first + down, first + along + down, begin, end])[..., ::-1]
@@ -176,7 +179,7 @@ _PIXELS_DIFFER = "patch-pixels-unlike-map"
 
 @dataclass(frozen=True, slots=True)
 class PatchFrames:
-    """Places of N patches in the map's CRS: centre [m], and the vectors of one ground metre along and left of travel, (N, 2)."""
+    """N patches in the map's CRS: centre [m], and vectors of one ground metre along and left of travel, (N, 2)."""
 
     centre_xy_m: Floats
     along_xy: Floats
@@ -217,12 +220,13 @@ def count_corners_on(grid: MapGrid, footprint_xy_m: Floats) -> Ints:
 
 
 def check_scale(frames: PatchFrames) -> None:
-    """Raise `TableError` if a ground metre is not nearly a metre on the map: then chords and end positions contradict each other."""
+    """Raise `TableError` if a ground metre is not a metre on the map: chords contradict their end positions."""
     scale = np.linalg.norm(frames.along_xy, axis=1)
     wrong = np.flatnonzero(~(np.abs(scale - 1.0) < _MAX_SCALE_ERROR))
     if wrong.size:
         raise TableError(
-            f"table segments: {wrong.size} chords contradict their end positions (the first is {scale[wrong[0]]:.3f} times as long "
+            f"table segments: {wrong.size} chords contradict their end positions "
+            f"(the first is {scale[wrong[0]]:.3f} times as long "
             "on the map); expected longitude and latitude of the same two points"
         )
 

@@ -1,9 +1,9 @@
 """Compiled sampling of patches from a map's tiles, one resampling a layer.
 
-Height and orthophoto are bilinear, class is nearest; a tap without data makes the pixel invalid. Heights are interpolated relative to
-the height under the patch's centre, so that single precision keeps 0.1 mm on any mountain. A patch's surroundings are first copied from
-the tiles into a small window that stays in the processor's cache. Indices of the inner loops are unsigned, since numba tests signed
-ones for Python's counting from the end.
+Height and orthophoto are bilinear, class is nearest; a tap without data makes the pixel invalid. Heights are
+interpolated relative to the height under the patch's centre, so that single precision keeps 0.1 mm on any mountain. A
+patch's surroundings are first copied from the tiles into a small window that fits the processor's cache. Indices of the
+inner loops are unsigned, since numba tests signed ones for Python's negative indices.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from tcpipe.terrain.layers import HEIGHT_NODATA
 class Tiles(NamedTuple):
     """Tiles in memory, one after another; layers of a kind follow each other.
 
-    ``relative`` is float32 [m] with NaN as no data, shape (S,); ``floats`` the same, (F·S,); ``greys`` and ``classes`` are uint8 with 0 as
-    no data, (G·S,), (C·S,). ``slots`` is the number of the tile in row i and column j of the map, (A, B), -1 for ground
-    without data; ``rows`` and ``cols`` are the pixels of a tile.
+    ``relative``: float32 [m], NaN: no data, shape (S,); ``floats``: the same, (F·S,); ``greys`` and ``classes``: uint8,
+    0: no data, (G·S,), (C·S,). ``slots``: number of the tile in row i and column j of the map, (A, B), -1 for ground
+    without data; ``rows`` and ``cols``: pixels of a tile.
     """
 
     relative: Floats32
@@ -38,11 +38,11 @@ class Tiles(NamedTuple):
 class Ground(NamedTuple):
     """Where N patches lie on the map.
 
-    ``boxes`` are the first row and column, last row and column (exclusive) of the map pixels that a patch and its chord touch, taps and a
-    pixel all around included, (N, 4); ``frames`` and ``chords`` affine map pixel positions (`patches.map_px_from_patch`,
-    `patches.chord_px`), (N, 6), (N, 4), with ``chord_points`` points on the chord to take the class at, which is that of layer
-    ``classed`` of the classes, -1 for none. ``pixel_size_m`` is the side of a patch pixel on the ground [m], ``step_m`` the unit of stored
-    heights [m].
+    ``boxes``: first row and column, last row and column (exclusive) of the map pixels that a patch and its chord touch,
+    with taps and a margin of one pixel, (N, 4). ``frames`` and ``chords``: affine map pixel positions
+    (`patches.map_px_from_patch`, `patches.chord_px`), (N, 6), (N, 4). ``chord_points``: points on the chord at which to
+    take the class; ``classed``: its layer among the classes, -1 for none. ``pixel_size_m``: side of a patch pixel on
+    the ground [m]; ``step_m``: unit of stored heights [m].
     """
 
     boxes: Ints
@@ -57,9 +57,9 @@ class Ground(NamedTuple):
 class Stacks(NamedTuple):
     """N patches of S x S pixels, by kind, as in `Tiles`.
 
-    ``relative`` is uint16 steps above the patch's smallest (65535 no data), (N, S, S); the others are (F, N, S, S), (G, N, S, S) and
-    (C, N, S, S). ``stats``, (N, 7): smallest height [m], slope along and to the left [rad], valid fraction, share of valid pixels more
-    than 1 m above the smallest, majority class under the chord, its share.
+    ``relative``: uint16 steps above the patch's smallest (65535: no data), (N, S, S); the others: (F, N, S, S), (G, N,
+    S, S) and (C, N, S, S). ``stats``, (N, 7): smallest height [m], slope along and to the left [rad], valid fraction,
+    share of valid pixels more than 1 m above the smallest, majority class under the chord, its share.
     """
 
     relative: NDArray[np.uint16]
@@ -72,8 +72,8 @@ class Stacks(NamedTuple):
 class _Taps(NamedTuple):
     """Position of each patch pixel in the window, (S·S,) each.
 
-    ``at`` is the window's pixel above and to the left, ``fx`` and ``fy`` are the distances from it to the right and down [px]; ``good``
-    marks valid patch pixels.
+    ``at``: the window's pixel above and to the left; ``fx``, ``fy``: distances from it to the right and down [px];
+    ``good``: valid patch pixels.
     """
 
     at: NDArray[np.uint64]
@@ -209,7 +209,7 @@ def _sample_classes(window: Bytes, width: int, taps: _Taps, out: Bytes) -> None:
 
 @compile_kernel
 def _store_height(rise: Floats32, good: Mask, step_m: float, out: NDArray[np.uint16]) -> tuple[np.float32, int]:
-    """Store valid heights in steps above the smallest; return that, 0 of none, and how many lie more than a metre above it."""
+    """Store valid heights in steps above the smallest; return the smallest (0 if none) and the count 1 m above it."""
     lowest, clipped = np.float32(np.inf), 0
     for k in range(np.uint64(rise.size)):
         lowest = rise[k] if good[k] and rise[k] < lowest else lowest
@@ -235,7 +235,7 @@ def _clear(out: Stacks, n: int, good: Mask) -> None:
 
 @compile_kernel
 def _fit_slopes(rise: Floats32, good: Mask, side: int) -> tuple[float, float]:
-    """Return the fitted plane's rise for one pixel along and one to the left, by valid pixels; 0 where they do not span a plane."""
+    """Return the fitted plane's rise per pixel along and left, by valid pixels; 0 where they span no plane."""
     middle = 0.5 * (side - 1)
     count = su = sv = suu = suv = svv = sh = suh = svh = 0.0
     for r in range(side):

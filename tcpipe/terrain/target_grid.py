@@ -1,13 +1,14 @@
-"""Choosing the one grid that a map's rasters are put on, and finding each raster's pixels from it.
+"""Choice of the grid of a map's rasters, and projection of its pixels into each raster.
 
-The grid's CRS is the height raster's if that is metric and upright over the whole raster, else the UTM zone of its middle. Its pitch is
-that of the finest raster (of the height, if none is more than 5 % finer), and its pixels coincide with that raster's where that is
-possible, so that the finest layer passes unchanged. Its extent is the height raster's.
+The grid's CRS is the height raster's if that is metric and upright over the whole raster, else the UTM zone of its
+middle. Its pitch is that of the finest raster (of the height, if none is more than 5 % finer), and its pixels coincide
+with that raster's where possible, so that the finest layer passes unchanged. Its extent is the height raster's.
 
 The grid all layers of a map share: a projected, metric CRS, square pixels, rows from north to south.
 
-Pixel (row i, column j) covers x from ``x_min_m + j·pitch`` and y downward from ``y_max_m - i·pitch``; its centre lies half a
-pitch further. *Pixel coordinates* count centres: (0, 0) is the centre of the first pixel, x along columns, y along rows.
+Pixel (row i, column j) covers x from ``x_min_m + j·pitch`` and y downward from ``y_max_m - i·pitch``; its centre is
+half a pitch further. *Pixel coordinates* count centres: (0, 0) is the centre of the first pixel, x along columns, y
+along rows.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from tcpipe.errors import MapError
 from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, is_metric
 
 LATTICE_STEP_PX = 16
-"""Positions are projected at every so-many-th pixel and interpolated between: 1e-7 px off for a site, 1e-3 px for a country."""
+"""Spacing of projected pixels, positions between are interpolated: error 1e-7 px for a site, 1e-3 px for a country."""
 
 MAX_PIXELS = 2**32
 """Most pixels of a map: 3.3 km a side at 5 cm; 21 GB before compression."""
@@ -39,7 +40,7 @@ _EDGE_POINTS = 21
 
 @dataclass(frozen=True, slots=True)
 class Georeference:
-    """Where a raster lies: its horizontal CRS, its affine (x = a·col + b·row + c, y = d·col + e·row + f at corners), its size, its name."""
+    """A raster's horizontal CRS, affine (x = a·col + b·row + c, y = d·col + e·row + f at corners), size and name."""
 
     crs: CRS
     affine: tuple[float, float, float, float, float, float]
@@ -54,7 +55,7 @@ class Georeference:
         return np.stack([a * col + b * row + c, d * col + e * row + f], axis=-1)
 
     def px_from_xy(self, xy: Floats) -> Floats:
-        """Return pixel *centre* coordinates (col, row; centres are integers) of points in the raster's CRS, shape (..., 2)."""
+        """Return pixel *centre* coordinates (col, row; centres: integers) of points in the raster's CRS, (..., 2)."""
         a, b, c, d, e, f = self.affine
         x, y = xy[..., 0] - c, xy[..., 1] - f
         determinant = a * e - b * d
@@ -108,11 +109,13 @@ def choose_crs(height: Georeference, wanted: CRS | None) -> CRS:
         return crs
     if wanted is not None:
         raise MapError(
-            f"{height.name}: the CRS {crs.name!r} is not metric there (its unit is more than 1 % off a metre of ground, "
+            f"{height.name}: the CRS {crs.name!r} is not metric there "
+            "(its unit is more than 1 % off a metre of ground, "
             "or it is mirrored); expected a UTM zone or a national grid"
         )
     raise MapError(
-        f"{height.name}: too large for one metric map: in {crs.name} its edges would be more than 1 % out of scale; cut out the site first"
+        f"{height.name}: too large for one metric map: "
+        f"in {crs.name} its edges would be more than 1 % out of scale; cut out the site first"
     )
 
 
@@ -178,9 +181,10 @@ def _compute_pixel_side(raster: Georeference, crs: CRS) -> float:
 def compute_source_lattice(  # noqa: PLR0917
     grid: MapGrid, raster: Georeference, projection: Projection | None, row0: int, rows: int, col0: int, cols: int
 ) -> Floats:
-    """Return the raster's pixel coordinates at every `LATTICE_STEP_PX`-th pixel of a block of the grid, shape (A, B, 2).
+    """Return the raster's pixel coordinates at every `LATTICE_STEP_PX`-th pixel of a grid block, shape (A, B, 2).
 
-    They begin one step above and left of the block, end at least one step beyond, and are not finite where the raster's CRS is undefined.
+    They begin one step above and left of the block, end at least one step beyond, and are not finite where the raster's
+    CRS is undefined.
     """
     step = LATTICE_STEP_PX
     i = row0 - step + step * np.arange(-(-rows // step) + 3)
@@ -197,10 +201,10 @@ def compute_source_lattice(  # noqa: PLR0917
 
 @dataclass(frozen=True, slots=True)
 class MapGrid:
-    """Where a map's pixels lie.
+    """Pixel grid of a map.
 
-    ``crs`` is ``EPSG:n`` or WKT 2, horizontal, in metres, x east-like and y north-like; ``x_min_m`` and ``y_max_m`` are the outer
-    corner of pixel (0, 0) (not its centre); ``pixel_size_m`` is the side of a pixel in CRS units.
+    ``crs``: ``EPSG:n`` or WKT 2, horizontal, in metres, x east-like and y north-like; ``x_min_m``, ``y_max_m``: outer
+    corner of pixel (0, 0) (not its centre); ``pixel_size_m``: side of a pixel in CRS units.
     """
 
     crs: str
@@ -226,7 +230,7 @@ class MapGrid:
         return (self.x_min_m, self.pixel_size_m, 0.0, self.y_max_m, 0.0, -self.pixel_size_m)
 
     def px_from_xy(self, xy_m: Floats) -> Floats:
-        """Return pixel coordinates (x along columns, y along rows; centres are integers) of map points, shape (..., 2)."""
+        """Return pixel coordinates (x along columns, y along rows; centres are integers) of map points, (..., 2)."""
         corner = np.array([self.x_min_m, self.y_max_m])
         px: Floats = (np.asarray(xy_m) - corner) * np.array([1.0, -1.0]) / self.pixel_size_m - 0.5
         return px
@@ -238,7 +242,7 @@ class MapGrid:
         return xy_m
 
     def contains(self, xy_m: Floats) -> Mask:
-        """Return whether map points, shape (..., 2) [m], lie on the grid, its outer edges included; what is not finite does not."""
+        """Return whether map points, shape (..., 2) [m], are finite and on the grid, outer edges included."""
         x_min, y_min, x_max, y_max = self.bounds_m
         x, y = xy_m[..., 0], xy_m[..., 1]
         inside: Mask = (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)

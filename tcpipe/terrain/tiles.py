@@ -23,7 +23,7 @@ CACHED_TILES = 96
 """Decoded tiles kept: 150 MB of three layers at 512 px."""
 
 _STRIP_TILES = CACHED_TILES // 3 - 3
-"""Three rows of a strip of the map are touched between two uses of a tile. So wide, 15,000 px, most maps are one strip."""
+"""Width of a strip [tiles]: three of its rows fit the cache. At 15,000 px most maps are one strip."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,17 +64,17 @@ class MapReader(ABC):
 
     @abstractmethod
     def read_tile(self, layer: str, i: int, j: int, out: NDArray[np.generic]) -> None:
-        """Put the tile in row i and column j into ``out``, contiguous, `tile_px` each way; beyond the map it holds no data."""
+        """Copy the tile in row i and column j into ``out``, contiguous, `tile_px` each way; no data beyond the map."""
 
 
 def choose_level(source: MapReader, pixel_size_m: float) -> MapReader:
-    """Return the map's level whose pixels are nearest below ``pixel_size_m`` [m]: coarse enough not to alias, fine enough to show all."""
+    """Return the map's coarsest level with pixels up to ``pixel_size_m`` [m], to neither alias nor lose detail."""
     factor = choose_factor(source.factors, source.grid.pixel_size_m, pixel_size_m)
     return source if factor == 1 else source.at(factor)
 
 
 def find_map_projection(source: MapReader, gnss_crs: str) -> Projection:
-    """Return the operation from the longitudes and latitudes of a geographic CRS to the map's CRS; `MapError` if one is not valid."""
+    """Return the projection from a geographic CRS (longitude, latitude) to the map's; `MapError` for an invalid CRS."""
     crs = parse_crs(source.grid.crs, where=f"map {source.name}")
     return Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, compute_area(crs, source.grid.bounds_m))
 
@@ -106,7 +106,7 @@ def read_tile_window(  # noqa: PLR0917
 
 
 class TilePool:
-    """The tiles that are being sampled, side by side in one array for each kind of layer; the least recently used make room."""
+    """Cache of tiles being sampled, one array for each kind of layer; replaces the least recently used."""
 
     __slots__ = ("_flat", "_held", "_map", "_stacks", "slots")
 
@@ -129,12 +129,12 @@ class TilePool:
         return Tiles(**flat, slots=self.slots, rows=self._map.tile_px, cols=self._map.tile_px)
 
     def expect(self, boxes: Ints) -> None:
-        """Have the tiles at hand that any of the boxes touches, as `hold` has them: it is called for parts of them soon."""
+        """Preload the tiles that any of the boxes touches, as in `hold`, for later calls with parts of them."""
         touched = _list_touched(boxes, self._map.tile_px, self.slots.shape)
         self._map.expect([tile for tile in touched if tile not in self._held])
 
     def hold(self, boxes: Ints) -> None:
-        """Make the tiles available that any of the boxes touches (first row and column, last row and column exclusive; (N, 4))."""
+        """Load the tiles that any of the boxes touches (first row, column, last row, column exclusive; (N, 4))."""
         wanted = _list_touched(boxes, self._map.tile_px, self.slots.shape)
         absent = [tile for tile in wanted if tile not in self._held]
         for tile in wanted:
