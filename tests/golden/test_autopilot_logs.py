@@ -3,8 +3,6 @@
 import json
 import re
 import shutil
-import struct
-from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -18,7 +16,6 @@ from shared_data import shared_data
 from storage_server import object_store
 
 import tcpipe
-from tcpipe.errors import RoleError
 from tcpipe.formats.logs.autopilot_log import read_autopilot_records
 from tcpipe.logs.topics import split_notes
 from tcpipe.pipeline.inspect import inspect
@@ -210,13 +207,6 @@ def test_weeks_of_gps_become_utc_with_its_leap_seconds(tmp_path, day, leap_s):
     assert row["position_covariance_type"] == 0  # no GPA tells the accuracy
 
 
-def test_a_receiver_that_does_not_know_the_time_leaves_the_time_since_boot(tmp_path):
-    log = DataFlash()
-    log.format("GPS", "QBIHLLefff", "TimeUS,Status,GMS,GWk,Lat,Lng,Alt,Spd,GCrs,VZ")
-    log.data("GPS", 7_000_000, 1, 0, 0, 1, 1, 1, 0.0, 0.0, 0.0)
-    assert read_one(log, tmp_path / "a.bin", "/GPS/fix")["log_time_ns"] == 7_000_000_000
-
-
 def test_drawn_current_is_negative_and_what_is_unknown_is_no_number(tmp_path):
     log = Ulog()
     log.format("battery_status", "float voltage_v", "float current_a")
@@ -283,29 +273,6 @@ def test_commands_of_px4_of_every_version_are_a_speed_and_a_turn_to_the_left(tmp
     log.data(name, 2, 1_500_000, *values)
     row = read_one(log, tmp_path / "a.ulg", f"/{name}/command")
     assert (row["twist.linear.x"], row["twist.angular.z"]) == expected
-
-
-@pytest.mark.parametrize("letter", ["n", "a", "B", "f", "q"])
-def test_fields_of_another_kind_than_they_should_be_break_nothing(tmp_path, letter):
-    fields = {
-        "GPS": "Status,GMS,GWk,Lat,Lng,Alt,Spd,GCrs,VZ", "GPA": "HAcc,VAcc,SAcc,VV,AEl", "IMU": "GyrX,GyrY,GyrZ,AccX,AccY,AccZ,GH",
-        "BAT": "Volt,Curr", "WENC": "Dist0,Dist1", "THR": "DesSpeed", "STER": "DesTurnRate", "PARM": "Name,Value", "DSF": "Dp",
-    }  # fmt: skip
-    log, rng = DataFlash(), np.random.default_rng(1)
-    for name, listed in fields.items():
-        labels = ",".join(listed.split(",")[: 3 if letter == "a" else None])  # a message has 255 bytes at most
-        log.format(name, "Q" + letter * len(labels.split(",")), f"TimeUS,{labels}")
-        size = struct.calcsize(log.codes[name][1]) - 8
-        for second in range(20):
-            log.parts.append(
-                b"\xa3\x95" + bytes([log.codes[name][0]]) + struct.pack("<Q", second * 10**6) + rng.bytes(size)
-            )
-    (tmp_path / "a.bin").write_bytes(log.bytes())
-    with tcpipe.read_log(tmp_path / "a.bin") as opened:
-        assert opened.tables(opened.topics).keys() >= {f"/{name}" for name in fields}
-        assert ("/IMU/imu" in opened.topics) == (letter in "Bfq")
-        with suppress(RoleError):  # most are no measurements
-            read_run(opened, ReadConfig(), robot=None, known=Profiles({}, ()))
 
 
 # ---------------------------------------------------------------- from the command to labels

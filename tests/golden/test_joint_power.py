@@ -1,7 +1,6 @@
 """Power of joints: messages of sensor_msgs/JointState through the installed command; the energy that numpy makes of the same numbers."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -176,12 +175,3 @@ def test_joints_without_a_table_are_no_power_and_inspect_names_the_lines(drive, 
     assert run.segments()["energy_joule"].null_count == run.segments().num_rows
     told = tcpipe("inspect", "run.mcap", cwd=tmp_path).stdout
     assert re.search(r"/joint_states.*joints = ", told)
-
-
-def test_a_pattern_that_is_none_is_refused_with_its_key(drive, tmp_path):
-    (tmp_path / "tcpipe.toml").write_text(RECIPE.replace('"(front', '"((front'))
-    write_mcap(tmp_path / "run.mcap", replace(drive).messages)
-    done = tcpipe("ingest", "run.mcap", "--store", "store", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "power_sources.0.joints" in done.stderr
-    assert "regular expression" in done.stderr

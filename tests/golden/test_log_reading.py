@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from shared_data import shared_data
 
-from tcpipe.formats.logs.log_file import find_logs, open_log
+from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.mcap_file import McapPart
 
 PEERS = (
@@ -97,27 +97,6 @@ def test_every_mcap_layout_of_the_conformance_suite(tmp_path):
         assert not part.damage
 
 
-def test_logs_that_rosbags_does_not_read():
-    base = shared_data("peers/rosbag2")
-    with open_log(base / "rosbag2_py/test/resources/mcap/talker") as log:
-        assert log.table("/topic")["data"].to_pylist() == [f"Hello, world! {i}" for i in range(10)]
-        assert log.table("/rosout").num_rows == 10
-    with open_log(base / "rosbag2_transport/test/resources/mcap/test_bag_for_seek") as log:
-        assert log.topics["topic1"].type_name == "test_msgs/msg/BasicTypes"
-        assert log.table("topic1").num_rows == 5
-        assert log.damage == []
-
-
-def test_what_cannot_be_decoded_is_named_and_counted():
-    bag = shared_data("peers/rosbag2/rosbag2_tests/resources/mcap/wrong_rmw_test")
-    with open_log(bag) as log:
-        assert log.tables(log.topics) == {}
-        lost = [finding for finding in log.findings if finding.code == "messages-not-decoded"]
-    found = {(finding.subject.name, finding.numbers["lost_messages_count"]) for finding in lost}
-    assert found == {("/array_topic", 4), ("/test_topic", 3)}
-    assert all("wrong_format" in finding.names["reason"] for finding in lost)
-
-
 @pytest.fixture(scope="module")
 def husky_directories(tmp_path_factory):
     archive = shared_data("damaged/husky_test1_rosbag2_dirs.tar.xz")
@@ -189,13 +168,3 @@ def test_every_intact_message_of_a_damaged_log_is_read_and_no_other(
     assert lost is None or lost in [finding.numbers.get("lost_messages_count") for finding in damage]
     if lost is not None:
         assert count + lost == HUSKY_MESSAGES
-
-
-def test_find_logs_in_a_tree_of_foreign_logs(husky_directories):
-    names = [str(path.relative_to(husky_directories)) for path in find_logs(husky_directories)]
-    assert names == [
-        "husky_test1_ros2_mcap",
-        "husky_test1_ros2_nometadata/husky_test1_ros2_sqlite3.db3",
-        "husky_test1_ros2_sqlite3",
-        "husky_test1_ros2_truncdb3",
-    ]

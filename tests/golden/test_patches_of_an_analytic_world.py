@@ -98,12 +98,6 @@ def test_footprints_are_true_squares_on_the_ellipsoid(site):
     np.testing.assert_allclose(got, wanted, atol=2e-4)
 
 
-def test_the_zone_edge_site_has_a_convergence_that_would_be_noticed():
-    world, _ = SITES["utm south, zone edge"]
-    lon, lat = pyproj.Transformer.from_crs(world.crs, "EPSG:4326", always_xy=True).transform(world.x_m, world.y_m)
-    assert abs(pyproj.Proj(world.crs).get_factors(lon, lat).meridian_convergence) > 1.5
-
-
 def test_layers_of_three_resolutions_and_crss_show_one_world(tmp_path):
     """Height in coarse UTM 34N pixels, grey fine, classes between: the map's double interpolation stays within the coarse bound."""
     world = World("EPSG:32633", 560_000.0, 5_215_000.0)

@@ -92,13 +92,6 @@ def test_husarions_drivers_are_summed_however_many_there_are(drivers, share, sig
     assert found.facts.current_sign.startswith("drawn_positive" if sign > 0 else "drawn_negative")
 
 
-def test_a_driver_that_is_missing_now_and_then_is_no_smaller_current(tmp_path):
-    rows = husarion(2)
-    rows[7] = husarion(1)[7]
-    found = watt(power_of(log_of(tmp_path / "a", "husarion_ugv_msgs/msg/RobotDriverState", rows)))
-    assert np.flatnonzero(np.isnan(found)).tolist() == [7]
-
-
 def test_an_earlier_panther(tmp_path):
     rows = [
         {"front": {"voltage": v, "current": a}, "rear": {"voltage": v, "current": a / 2}}

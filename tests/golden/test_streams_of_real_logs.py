@@ -71,15 +71,6 @@ def test_a_real_husky_without_power() -> None:
     assert up @ force > 0.99 * np.linalg.norm(force)
 
 
-def test_a_jackal_in_simulated_time() -> None:
-    found = read(shared_data("robot_localization/test2.bag"))
-    assert found.robot == "jackal"
-    stamps = found.tables["imu"]["stamp_ns"].to_numpy()
-    assert 47e9 < stamps[0] < 48e9
-    assert found.sensors["wheel_odometry"].time_source == "header"
-    assert found.report.facts.epochs == 1
-
-
 def test_duplicates_and_backward_stamps_of_an_old_recording() -> None:
     path = shared_data("robot_localization/test1_2014.bag")
     found = read(path)

@@ -1,6 +1,5 @@
 """The recipe as a whole: what is the same by name is the same by bytes, and no valid value breaks a stage or lasts."""
 
-from contextlib import suppress
 from dataclasses import fields, replace
 
 import pytest
@@ -8,7 +7,6 @@ from recipe_values import keys, other_values, with_value
 from simulated_streams import log_of, streams_of
 from stored_files import only_run
 
-from tcpipe.errors import TcpipeError
 from tcpipe.formats.recipe_toml import (
     format_commented_toml,
     ingest_key,
@@ -99,14 +97,6 @@ def test_no_stage_breaks_at_the_ends_of_a_key(track, streams, key, value):
     fused = fuse_run(streams, recipe.fuse, run_id="run") if section(key) == "fuse" else track
     labelled = after_fusion(fused, streams, recipe)
     assert sum(labelled.distance_by_reason_m.values()) > 1.0
-
-
-@pytest.mark.parametrize("value", [*other_values("read.extrinsics")[2:6], None], ids=str)
-def test_no_placement_and_no_offset_breaks_fusion(log, value):
-    config = replace(Recipe().read, **({"extrinsics": value} if value else {"time_offset_s": {"gnss": 2e9}}))
-    streams = streams_of(log, config)
-    with suppress(TcpipeError):  # a plain line is an answer
-        after_fusion(fuse_run(streams, Recipe().fuse, run_id="run"), streams, Recipe())
 
 
 @pytest.mark.parametrize("key", keys())

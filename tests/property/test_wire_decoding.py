@@ -154,20 +154,6 @@ def _definitions():
     return get_types_from_msg("string[] texts\nfloat64 number\n", "a/msg/A")
 
 
-def test_arrays_of_messages_that_hold_short_arrays_of_messages():
-    leaf = make_record("a/msg/Leaf", (("x", Scalar("f8")),))
-    inner = make_record("a/msg/Inner", (("b", Array(leaf, 2)), ("c", Array(Scalar("i2"), 4))))
-    outer = make_record("a/msg/Outer", (("a", Array(inner, 5)),))
-    values = [
-        {"a": [{"b": [{"x": m + 10.0 * i + j} for j in range(2)], "c": [m, i, -m, -i]} for i in range(5)]}
-        for m in range(12)
-    ]
-    found, lost = decoded(outer, [Writer(b"\x00\x01").message(outer, value) for value in values], "cdr")
-    found.validate(full=True)
-    assert lost == 0
-    assert found["a"].to_pylist() == [value["a"] for value in values]
-
-
 @pytest.mark.parametrize("header", [b"\x00\x01", None])
 def test_a_list_too_long_to_be_walked_side_by_side_is_read_message_by_message(header):
     of = make_record("a/msg/A", (("texts", Array(Text(), None)), ("number", Scalar("f8"))))

@@ -85,13 +85,6 @@ def temporary(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_cached_kernel_of_a_class_that_is_gone_is_compiled_anew(run_again, tmp_path):
-    run_again()
-    fields = tmp_path / "fields.py"
-    fields.write_text(fields.read_text().replace("Pair", "Twin"))
-    assert run_again("outer", "from fields import Pair", "from fields import Twin as Pair") == (16.0, 0)
-
-
 def test_falls_back_to_a_temporary_cache(tmp_path):
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     environment.pop("NUMBA_CACHE_DIR", None)

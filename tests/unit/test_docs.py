@@ -10,7 +10,6 @@ from pathlib import Path
 
 import click
 import pytest
-from PIL import Image
 from synthetic_store import box, region_file, small_store
 
 from tcpipe.cli import cli
@@ -76,26 +75,6 @@ def test_the_changelog_of_versions_before_2_has_at_most_60_lines() -> None:
     assert len(text[text.index("## 1.0.0") :].splitlines()) <= 60
 
 
-def test_the_tour_is_small_and_short() -> None:
-    path = ROOT / "docs/images/tour.webp"
-    assert path.stat().st_size <= 2_000_000
-    with Image.open(path) as tour:
-        durations_ms = []
-        for frame in range(tour.n_frames):
-            tour.seek(frame)
-            tour.load()
-            durations_ms.append(tour.info["duration"])
-        assert tour.info["loop"] == 0
-    assert 15_000 <= sum(durations_ms) <= 25_000
-
-
-def test_the_picture_of_a_metre_is_small() -> None:
-    path = ROOT / "docs/images/metre.png"
-    assert path.stat().st_size <= 60_000
-    with Image.open(path) as picture:
-        assert picture.size == (1600, 760)
-
-
 def test_every_decision_stands_once_in_the_index() -> None:
     decisions = ROOT / "docs/adr"
     listed = re.findall(
@@ -139,6 +118,18 @@ def test_files_and_modules_that_pages_name_exist() -> None:
             source = places[-1] if places[-1].exists() else ROOT / parent.replace(".", "/") / "__init__.py"
             if not any(place.exists() for place in places[:2]) and not (source.exists() and name in source.read_text()):
                 wrong.append(f"{page.name}: {dotted}")
+    assert not wrong
+
+
+def test_names_in_the_table_of_changes_are_defined_where_it_says() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    places = re.findall(r"`(tcpipe/[\w/.]+): (\w+)`", text)
+    assert len(places) >= 15
+    wrong = []
+    for file, name in places:
+        defined = rf"^(def {name}\b|class {name}\b|{name}\b.* = )"
+        if not re.search(defined, (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE):
+            wrong.append(f"{file}: {name}")
     assert not wrong
 
 

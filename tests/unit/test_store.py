@@ -9,13 +9,12 @@ from pathlib import Path
 import pytest
 from object_gateway import open_bucket
 from storage_server import READ_ONLY
-from stored_files import manifest, table
+from stored_files import table
 from synthetic_store import add_run, change_run, lanes, segments, supersede, tag_run
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.documents import scan
 from tcpipe.formats.place import Place
-from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store, check_map_name, is_store, name_run, open_store
 
@@ -94,17 +93,6 @@ def test_a_run_that_is_written_again_replaces_the_one_before_and_recipes_live_si
     assert store.find_runs(f"{RUN}/nosuch") == store.find_runs("nosuch") == []
 
 
-def test_a_run_whose_tables_were_given_up_does_not_count_in_the_call_that_gives_them_up_either(root):
-    store = open_store(root, create=True)
-    put(store)
-    state = store.scan()
-    (row,) = state.list_rows()
-    forget_tables(store, state, row)
-    for found in (state, store.scan()):
-        (row,) = found.list_rows()
-        assert (row.blob, found.has_payload(row), store.runs(found)) == ("", False, [])
-
-
 def test_two_that_write_one_run_at_once_write_to_folders_of_their_own_and_all_readers_find_the_same_one(root):
     store = open_store(root, create=True)
     before = store.scan()
@@ -131,16 +119,6 @@ def test_tags_are_added_to_those_of_a_log_and_outlive_its_runs(root):
     put(store, 9.0, sha256="f" * 64, recipe=Recipe(read=ReadConfig(ignore_topics=["/none"])))
     assert [run.facts.tags for run in store.runs()] == [wanted, wanted]
     assert b"Eva" not in store.place.read(run.document), "no fact is written twice"
-
-
-def test_a_manifest_that_is_read_is_the_record_that_was_written(root):
-    store = open_store(root, create=True)
-    put(store, tags={"soil": "dry"})
-    change_run(store, RUN, idle_watt=7.0)
-    (run,) = store.runs()
-    assert (run.manifest.idle_watt, run.facts.idle_watt) == (7.0, 7.0)
-    for field in ("run_id", "recipe_id", "log", "segments", "distance_by_reason_m", "findings", "tags", "tables"):
-        assert getattr(run.manifest, field) == getattr(run.facts, field)
 
 
 def remove_payload(store, blob):
@@ -184,16 +162,6 @@ def test_a_table_that_is_not_as_it_was_written_is_named_and_not_used(tmp_path, h
     assert store.prove([run])[RUN].startswith(f"{path}: ")
     path.write_bytes(whole)
     assert store.prove([run]) == {}
-
-
-def test_a_manifest_that_is_gone_costs_one_run_and_nothing_else(tmp_path):
-    store = open_store(tmp_path / "store", create=True)
-    for name in ("a", "b"):
-        put(store, name=name)
-    manifest(store.runs()[0]).unlink()
-    assert [run.run_id for run in store.runs()] == ["b"]
-    put(store, name="a")
-    assert counted(store) == [10, 10]
 
 
 def test_tables_that_were_compared_are_compared_again_only_when_they_are_written_again(tmp_path, monkeypatch):
@@ -327,22 +295,6 @@ def test_a_map_that_a_reader_has_found_stays_where_it_is_when_another_takes_its_
     assert list(store.scan().maps) == ["site"]
     with pytest.raises(StoreError, match="no map 'other' in the store"):
         store.find_map("other")
-
-
-def test_a_map_that_two_add_at_once_is_one_of_them_for_all_readers(root):
-    store = open_store(root, create=True)
-    add_map(store, "mine", before=lambda: add_map(store, "another's"))
-    assert read_tile(store, store.find_map("site")) == b"mine", "it was put later, by one that had seen the other"
-
-
-def test_a_map_whose_answer_is_lost_is_there(served):
-    store = open_store("s3://tests/store", create=True)
-
-    def lose():
-        served.lost = 3
-
-    add_map(store, "mine", before=lose)
-    assert read_tile(store, store.find_map("site")) == b"mine"
 
 
 @pytest.mark.parametrize("name", ["", ".", "../up", "a/b", "-x", "Ä"])

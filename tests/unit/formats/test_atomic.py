@@ -51,19 +51,6 @@ def test_a_failed_directory_leaves_the_old_one_and_nothing_else(tmp_path: Path) 
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_a_killed_process_left_goes_when_its_place_is_written_again(tmp_path: Path) -> None:
-    program = (
-        "import os, signal, sys; from pathlib import Path; from tcpipe.formats.atomic import write_atomic_directory, write_atomic_file\n"
-        "with write_atomic_directory(Path(sys.argv[1]) / 'd') as d, write_atomic_file(Path(sys.argv[1]) / 'f') as f:\n"
-        "    (d / 'half').touch(); f.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    subprocess.run([sys.executable, "-c", program, tmp_path], check=False)
-    assert len(list(tmp_path.iterdir())) == 2
-    with write_atomic_directory(tmp_path / "d"), write_atomic_file(tmp_path / "f"):
-        pass
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "f"]
-
-
 def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
     with write_atomic_directory(tmp_path / "d") as slow:
         (slow / "slow").touch()
@@ -89,9 +76,7 @@ def test_a_place_that_cannot_be_is_told_by_its_own_name(tmp_path: Path, write: C
 
 
 @pytest.mark.parametrize("write", [write_atomic_file, write_atomic_directory])
-@pytest.mark.parametrize(
-    "number", [errno.EACCES, errno.EPERM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ESTALE, errno.ENXIO]
-)
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ENOSPC, errno.ESTALE])
 @pytest.mark.parametrize("named", [None, "temporary", "place", "parent"])
 def test_whatever_fails_in_writing_names_the_place(
     tmp_path: Path, write: Callable[..., Any], number: int, named: str | None

@@ -14,7 +14,6 @@ from object_gateway import open_bucket
 
 from tcpipe.errors import StoreError
 from tcpipe.formats import documents
-from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.documents import (
     INDEX,
     KINDS,
@@ -102,13 +101,6 @@ def test_a_file_of_another_form_of_name_is_no_document(here, file):
     assert describe(scan_anew(here)) == describe(before)
 
 
-def test_folders_of_payload_have_names_that_nobody_else_takes(place):
-    names = {make_unique_name() for _ in range(1000)}
-    assert len(names) == 1000
-    place.put(f"blobs/{min(names)}/a", b"a")
-    assert scan(place).blobs == {min(names)}
-
-
 # --- which document counts ------------------------------------------------------------------------------------------
 
 
@@ -156,15 +148,6 @@ def test_bytes_that_differ_from_their_digest_are_no_document_and_the_one_before_
         read_record(place, names[2], Tags)
     put(place, found, tags(soil="mud"))
     assert scan_anew(place).find_tags("a log") == {"soil": "mud"}, "its number is above those that are damaged"
-
-
-def test_a_key_of_damaged_documents_alone_has_no_record_and_is_written_with_a_higher_number(place):
-    name = put(place, scan(place), tags(soil="dry"))
-    place.put(name, b"")
-    found = scan_anew(place)
-    assert (found.find_tags("a log"), found.damaged, found.is_new) == ({}, [name], False)
-    put(place, found, tags(soil="dry"))
-    assert scan_anew(place).find_tags("a log") == {"soil": "dry"}
 
 
 RECORDS = {
@@ -279,20 +262,6 @@ def test_the_index_is_written_when_many_documents_are_not_in_it_and_no_document_
     assert index(place) == data, "it is not written again"
 
 
-def test_in_a_large_index_more_documents_may_be_missing(here):
-    put_many(here, 400)
-    scan_anew(here)
-    before, state = index(here), scan(here)
-    for number in range(24):
-        put_document(here, state, "tags", make_key(f"log {number}"), Tags(f"log {number}", {"again": "yes"}))
-    assert scan_anew(here).read == 24
-    assert index(here) == before
-    put_document(here, state, "tags", make_key("new"), tags(soil="dry"))
-    assert scan_anew(here).read == 25
-    assert index(here) != before
-    assert scan_anew(here).read == 0
-
-
 @pytest.mark.parametrize("how", ["deleted", "cut", "no Parquet", "other columns", "other records"])
 def test_an_index_that_is_deleted_or_damaged_is_made_again_and_changes_no_state(place, how):
     put_many(place, 20)
@@ -341,10 +310,6 @@ def test_an_index_that_names_documents_which_are_gone_gives_none_of_them(here):
     assert found.read == 0
 
 
-def refuse(*_, **__):
-    raise StoreError("read-only")
-
-
 @settings(max_examples=30)
 @given(place_in_file=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_an_index_with_a_wrong_bit_changes_no_state(store_of_twenty, place_in_file, bit):
@@ -371,14 +336,6 @@ def test_a_store_in_a_bucket_whose_index_is_there_is_scanned_by_listings_and_one
         assert scan_anew(place).read == 0
         counts.append((served[before:], served.requests))
     assert counts == [(["store/index.parquet"], len(KINDS) + 2)] * 2, "a listing of each kind, and of the payload"
-
-
-def test_a_file_whose_name_has_other_letters_than_hexadecimal_digits_is_no_document(tmp_path):
-    place = Place(tmp_path)
-    place.put(f"calls/{'z' * 16}.1.{'z' * 16}.json", b"{}")
-    place.put(f"calls/{'0' * 16}.٣.{'0' * 16}.json", b"{}")
-    assert scan(place).is_new
-    assert len(list(documents.find_strange_files(place))) == 2
 
 
 def test_a_document_that_is_removed_while_a_store_is_scanned_is_not_damaged(tmp_path, monkeypatch):

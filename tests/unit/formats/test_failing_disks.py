@@ -66,16 +66,15 @@ def bad_sector(monkeypatch):
     return spoil
 
 
-@pytest.mark.parametrize("wanted", [1, 2])
 @pytest.mark.parametrize("name", LOGS)
-def test_a_disk_that_dies_leaves_damage(tmp_path, name, wanted):
+def test_a_disk_that_dies_leaves_damage(tmp_path, name):
     path = LOGS[name](tmp_path / name)
     with open_log(path) as log:
         fail(path)
-        tables = log.tables(list(log.topics)[:wanted])
-        held = sum(topic.message_count for topic in list(log.topics.values())[:wanted])
+        tables = log.tables(log.topics)
+        held = sum(topic.message_count for topic in log.topics.values())
         (lost,) = [finding for finding in log.findings if finding.names.get("reason") == "Input/output error"]
-    assert [table.num_rows for table in tables.values()] == [0] * wanted
+    assert [table.num_rows for table in tables.values()] == [0, 0]
     assert lost.code == "data-unreadable"
     assert lost.numbers.get("lost_messages_count", 0) >= held or lost.numbers["lost_bytes"]
 

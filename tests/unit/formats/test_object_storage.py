@@ -9,8 +9,6 @@ from storage_server import FORBIDDEN
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.logs.table_folders import is_log_file
-from tcpipe.formats.object_storage import lay_out_objects, make_stand_ins
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe
 
@@ -57,16 +55,6 @@ def test_only_what_belongs_to_a_log_is_copied(bucket):
     assert set(bucket[1]) == {"field/bag/bag.db3", "field/bag/metadata.yaml", "field/my run.mcap", "junk.bag"}
 
 
-def test_stand_ins_cost_nothing(bucket, tmp_path):
-    (tmp_path / "here").mkdir()
-    place = make_stand_ins("s3://drives/field", tmp_path / "here", wanted=is_log_file)
-    stand_in = place / "my run.mcap"
-    assert stand_in.stat().st_size == (bucket[0] / "field" / "my run.mcap").stat().st_size
-    assert stand_in.stat().st_mtime == 1_600_000_000
-    assert not any(stand_in.read_bytes())
-    assert bucket[1] == []
-
-
 @pytest.mark.parametrize(
     ("url", "said"),
     [
@@ -103,22 +91,6 @@ def test_a_copy_that_does_not_fit_is_told_in_one_line(bucket):
             open_log("s3://drives/field/bag")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-def test_a_file_whose_url_is_percent_encoded(tmp_path):
-    path = write_mcap(tmp_path / "a b%20c.mcap", MESSAGES)
-    with lay_out_objects(path.as_uri(), wanted=is_log_file, by_range=()) as (copy, by_range):
-        assert copy.name == path.name
-        assert copy.read_bytes() == path.read_bytes()
-        assert not by_range
-
-
-def test_a_folder_by_its_file_url_is_read_by_range_and_copied(bucket):
-    directory = bucket[0] / "field"
-    with lay_out_objects(directory.as_uri(), wanted=is_log_file, by_range=(".mcap",)) as (copy, by_range):
-        (stored,) = by_range.values()
-        assert bytes(stored.ranges([(0, stored.size_bytes)])[0]) == (directory / "my run.mcap").read_bytes()
-        assert (copy / "bag" / "bag.db3").read_bytes() == (directory / "bag" / "bag.db3").read_bytes()
 
 
 def test_an_endpoint_that_is_no_address_is_refused(monkeypatch):

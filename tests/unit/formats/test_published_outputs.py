@@ -98,17 +98,6 @@ def test_of_two_at_once_one_wins_and_none_mixes(place):
     assert seen(place) == ("mine", "mine"), "it saw theirs before it wrote its pointer"
 
 
-def test_of_two_with_one_number_the_smaller_digest_counts_for_all_readers(place):
-    write(place, "first")
-    write(place, "second")
-    found = builds(place)
-    digests = {point(place, 3, found[text]): text for text in found}
-    assert seen(place)[0] == digests[min(digests)]
-    write(place, "third")
-    assert seen(place) == ("third", "third")
-    assert any(name.startswith("current.4.") for name in pointers(place))
-
-
 def test_many_at_once_are_all_whole_and_readers_agree_on_one(place):
     texts = [str(number) for number in range(6)]
     with ThreadPoolExecutor(len(texts)) as pool:
@@ -176,13 +165,6 @@ def test_killed_at_any_request_nobody_sees_half_and_the_next_call_is_not_blocked
     assert steps == 3
 
 
-def test_killed_before_the_first_pointer_there_is_nothing_and_the_next_call_builds(place):
-    place.put("builds/0123456789abcdef/data", b"killed")
-    assert find_newest(place.root, [CARD]) is None
-    write(place, "new")
-    assert seen(place) == ("new", "new")
-
-
 def test_a_build_goes_seven_days_after_its_replacement_by_the_clock_of_the_bucket(aged):
     place, age = aged
     found = []
@@ -211,21 +193,6 @@ def test_what_no_pointer_names_goes_when_it_is_seven_days_older_than_the_newest_
     assert place.read("builds/notes.txt") == b"not ours"
     assert place.read("dataset.json") is not None, "nothing goes that no build has made"
     assert [name.split(".")[1] for name in pointers(place)] == ["2", "3", "4"], "both of number 1 lost 8 days ago"
-
-
-def test_a_removal_that_was_killed_is_completed_by_the_next_build(aged, monkeypatch):
-    place, age = aged
-    write(place, "1")
-    write(place, "2")
-    age(8)
-    with monkeypatch.context() as killed:
-        killed.setattr(Place, "delete", lambda *_: (_ for _ in ()).throw(_Killed))
-        with pytest.raises(_Killed):
-            write(place, "3")
-    assert seen(place) == ("3", "3")
-    assert all("/builds/" in name for name in find_unlisted_files(place.root)), "verify names what is to go"
-    write(place, "4")
-    assert sorted(builds(place)) == ["2", "3", "4"]
 
 
 def test_a_reader_asks_three_times_however_many_builds_there_are(served):

@@ -71,6 +71,7 @@ def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
                     {"type": "a/msg/B", "voltage": "v", "sign": "plus"},
                     {"type": "a/msg/B", "energy": "e", "current": "i"},
                     {"type": "a/msg/B", "voltage": "v", "unsupported_reason": "tells phases"},
+                    {"type": "sensor_msgs/msg/JointState", "joints": "((left"},
                 ],
             },
             where="tcpipe.toml",
@@ -88,6 +89,7 @@ def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
         'power_sources.3.sign is "plus"; expected one of auto',
         'power_sources.4.current is "i"; expected one of current, power, energy and joints',
         'power_sources.5.unsupported_reason is "tells phases"; expected no field besides it',
+        'power_sources.6.joints is "((left"; expected a regular expression',
     ]
     assert len(said) == len(keys)
     assert all(line.startswith(key) for line, key in zip(said, keys, strict=True)), said

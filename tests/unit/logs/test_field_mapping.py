@@ -7,7 +7,6 @@ from tcpipe.logs.field_mapping import (
     MAPPED,
     MAPPED_TYPES,
     find_mapping_problems,
-    find_topic,
     make_mapped_message,
     make_message_fields,
     parse_stamps_ns,
@@ -15,8 +14,6 @@ from tcpipe.logs.field_mapping import (
     utc_from_gps_ns,
 )
 from tcpipe.logs.messages import read_messages
-from tcpipe.recipe import TableMapping
-from tcpipe.robots import TABLE_POWER
 
 PLACE = {"x": 1.0, "y": 2.0, "z": 3.0, "x_std": 0.1, "y_std": 0.2, "z_std": 0.3}
 NOW_S = 1_760_456_485
@@ -120,18 +117,6 @@ def test_deviations_are_the_diagonal_of_a_covariance():
     found = read_messages(columns, "pose", MAPPED_TYPES["pose"]).columns
     assert [found[f"{axis}_var_m2"][0] for axis in ("east", "north", "up")] == pytest.approx([0.01, 0.04, 0.09])
     assert [found[f"{axis}_m"][0] for axis in "xyz"] == [1.0, 2.0, 3.0]
-
-
-def test_voltage_and_current_apart_are_bare_numbers_called_so():
-    bare = "std_msgs/msg/Float64"
-    for name, columns, wanted in (
-        ("left_voltage", {"voltage": "value"}, ("/left_voltage", bare)),
-        ("left", {"current": "value"}, ("/left/current", bare)),
-        ("pack", {"voltage": "v", "current": "i"}, ("/pack", "sensor_msgs/msg/BatteryState")),
-        ("pack", {"power": "p"}, ("/pack", TABLE_POWER)),
-    ):
-        source = TableMapping("a.csv", "power", columns).make_power_source(name)
-        assert find_topic(name, "power", columns, source and source.type) == wanted
 
 
 def test_a_message_of_ones_own_is_mapped_field_by_field_and_all_that_is_wrong_is_said():

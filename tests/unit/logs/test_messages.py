@@ -181,14 +181,6 @@ def test_an_orientation_that_never_changes_is_no_orientation() -> None:
     assert [of.code for of in found.findings] == ["orientation-constant"]
 
 
-def test_imu_rows_without_a_gyro_or_finite_numbers_are_dropped() -> None:
-    columns = imu()
-    columns["angular_velocity_covariance"][0, 0] = -1
-    columns["linear_acceleration.x"][1] = np.nan
-    found = read_messages(columns, "imu", roles.IMU)
-    assert found.dropped == {"not_measured": 1, "not_finite": 1}
-
-
 def odometry(speed_mps: float = 0.5) -> dict[str, np.ndarray]:
     linear = np.tile([speed_mps, 0.0, 0.0], (N, 1))
     position = np.stack((np.arange(N) * 0.05, np.zeros(N), np.zeros(N)), -1)
@@ -254,15 +246,6 @@ def test_an_empty_twist_is_standstill_on_a_resting_pose_alone() -> None:
     found = read_messages(columns, "wheel_odometry", roles.ODOMETRY)
     assert (found.columns["velocity_x_mps"] == 0.0).all()
     assert found.findings == ()
-
-
-def test_odometry_without_numbers_is_dropped_without_pose_kept() -> None:
-    columns = odometry()
-    columns["twist.twist.linear.x"][0] = np.nan
-    columns["pose.pose.orientation.w"][1] = 0.0
-    found = read_messages(columns, "wheel_odometry", roles.ODOMETRY)
-    assert found.dropped == {"not_finite": 1}
-    assert np.isnan(found.columns["x_m"]).tolist() == [True] + [False] * (N - 2)
 
 
 def test_twists_measured_and_commanded() -> None:

@@ -197,31 +197,6 @@ def covering(name: str, type_name: str, count: int, span_s: float) -> Topic:
     return Topic(name, type_name, count, 0, round(span_s * 1e9), "cdr", "")
 
 
-def during(name: str, type_name: str, start_s: float, end_s: float) -> Topic:
-    return Topic(name, type_name, round(20 * (end_s - start_s)), round(start_s * 1e9), round(end_s * 1e9), "cdr", "")
-
-
-@pytest.mark.parametrize("half_s", [10.0, 30.0, 50.0])
-@pytest.mark.parametrize(
-    ("role", "kind", "names"),
-    [
-        ("gnss", FIX, ("/fix", "/gps/fix")),
-        ("imu", IMU, ("/imu/data", "/xsens/imu")),
-        ("wheel_odometry", ODOMETRY, ("/wheel/odom", "/odom")),
-        ("command", "geometry_msgs/msg/Twist", ("/cmd_vel", "/base/cmd_vel")),
-    ],
-)
-def test_a_topic_that_is_renamed_during_the_log_is_used_under_both_names(role, kind, names, half_s) -> None:
-    others = [during("/other/odom", ODOMETRY, 0, 60)] if role != "wheel_odometry" else []
-    for first, second in (names, names[::-1]):
-        found = assign_roles([during(first, kind, 0, half_s), during(second, kind, half_s + 0.1, 60), *others], {})
-        assert set(played(found)[role]) == {first, second}
-        chosen = assign_roles(
-            [during(first, kind, 0, half_s), during(second, kind, half_s + 0.1, 60), *others], {role: [*names]}
-        )
-        assert played(chosen)[role] == names
-
-
 def test_a_named_topic_without_messages_leaves_the_role_to_the_next() -> None:
     log = [topic("/front/fix", FIX, 0), topic("/rear/fix", FIX), topic("/odom", ODOMETRY)]
     assert played(assign_roles(log, {"gnss": ["/front/fix", "/rear/fix"]}))["gnss"] == ("/rear/fix",)
@@ -246,16 +221,6 @@ def test_what_covers_as_much_wins_by_its_name_and_a_slow_sensor_covers_all() -> 
     assert played(assign_roles(unknown, {})) == {"wheel_odometry": ("/wheel/odom",)}
     alike = [covering("/odom_a", ODOMETRY, 400, 40.0), covering("/odom_b", ODOMETRY, 658, 65.7)]
     assert "ambiguous" in assign_roles(alike, {}).problems[0]
-
-
-def test_of_power_a_side_that_fell_silent_is_still_a_side() -> None:
-    sides = [covering("/left/battery", BATTERY, 3, 1.0), covering("/right/battery", BATTERY, 658, 65.7)]
-    found = assign_roles([*sides, covering("/wheel/odom", ODOMETRY, 658, 65.7)], {})
-    assert played(found)["power"] == ("/left/battery", "/right/battery")
-    status = covering("/status", HUSKY, 3, 1.0)
-    assert played(assign_roles([status, sides[1], covering("/wheel/odom", ODOMETRY, 658, 65.7)], {}))["power"] == (
-        "/right/battery",
-    )
 
 
 def test_what_cannot_be_decoded_is_a_finding_each_and_one_line_of_the_error() -> None:
@@ -306,19 +271,6 @@ def test_a_log_without_motion_says_so_in_three_lines_and_how_to_use_what_was_lef
     empty = assign_roles([topic("/odom", ODOMETRY, count=0)], {})
     assert (len(empty.problems), proposals(empty)) == (2, []), "an empty topic is no way out"
     assert not proposals(assign(("/tcpipe/fix", FIX))), "nor is what was made of another log"
-
-
-def test_empty_and_unreadable_topics_play_nothing() -> None:
-    found = assign_roles(
-        [
-            topic("/odom", ODOMETRY),
-            topic("/b/odom", ODOMETRY, count=0),
-            topic("/c/odom", ODOMETRY, problem="no definition"),
-        ],
-        {},
-    )
-    assert played(found) == {"wheel_odometry": ("/odom",)}
-    assert found.left_out == {"/b/odom": "it has no messages", "/c/odom": "it cannot be read: no definition"}
 
 
 @pytest.mark.parametrize(
@@ -379,11 +331,6 @@ def test_the_robot_given_rules_and_must_exist() -> None:
         assign(("/odom", ODOMETRY), robot="spot")
 
 
-def test_the_order_of_the_topics_does_not_matter() -> None:
-    topics = [topic("/b/imu", IMU), topic("/a/imu", IMU), topic("/odom", ODOMETRY), topic("/z/odom", ODOMETRY)]
-    assert assign_roles(topics, {}) == assign_roles(topics[::-1], {})
-
-
 def test_a_motors_phase_currents_play_no_role_and_the_reason_is_said() -> None:
     found = assign(
         ("/a300_0001/platform/odom", ODOMETRY),
@@ -441,12 +388,6 @@ def test_what_a_pose_was_made_from_is_not_fused_again() -> None:
     assert "names /fix as gnss and /odometry/filtered as pose" in both.problems[0]
 
 
-def test_a_mapped_role_is_played_by_any_type_that_the_recipe_names() -> None:
-    mine = topic("/rtk", "my_msgs/msg/Pvt")
-    assert assign_roles([mine], {"gnss": ["/rtk"]}).problems
-    assert played(assign_roles([mine], {"gnss": ["/rtk"]}, mapped=["gnss"])) == {"gnss": ("/rtk",)}
-
-
 TWIST_COVARIANCE, NMEA = "geometry_msgs/msg/TwistWithCovarianceStamped", "nmea_msgs/msg/Sentence"
 
 
@@ -502,11 +443,6 @@ def test_of_two_receivers_that_of_the_fixes_is_taken_and_without_fixes_none() ->
 KINDS = {"fix": "sensor_msgs/msg/NavSatFix", "imu": "sensor_msgs/msg/Imu", "odom": "nav_msgs/msg/Odometry"}
 
 
-def test_three_roles_in_two_namespaces_are_two_robots():
-    found = find_robot_namespaces({name: [f"/a/{name}", f"/b/x/{name}"] for name in ("gnss", "imu", "power")})
-    assert found == {"/a": ("gnss", "imu", "power"), "/b": ("gnss", "imu", "power")}
-
-
 def test_a_camera_and_a_controller_are_no_robots():
     candidates = {
         "imu": ["/imu/data", "/zed2/imu/data"],
@@ -532,11 +468,6 @@ def test_the_namespace_answers_the_question():
         found = assign_two_robots(name)
         assert found.problems == ()
         assert {topic for role in found.roles.values() for topic in role.topics} == {f"/bert/{kind}" for kind in KINDS}
-
-
-def test_topics_chosen_by_name_need_no_namespace():
-    chosen = {"gnss": ["/anna/fix"], "imu": ["/bert/imu"], "wheel_odometry": ["/anna/odom"]}
-    assert assign_two_robots(chosen=chosen).problems == ()
 
 
 def test_a_namespace_that_holds_nothing_is_a_mistake():

@@ -6,7 +6,6 @@ import struct
 from contextlib import closing
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType
 from random_messages import (
@@ -20,8 +19,6 @@ from random_messages import (
 )
 from rosbags.rosbag1 import Writer as BagWriter
 
-from tcpipe.formats.logs.bag_file import BagPart, read_indexed_messages
-from tcpipe.formats.logs.chunk_reading import Excerpt
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets
 
@@ -181,40 +178,6 @@ def test_texts_that_are_not_utf8_are_replaced_and_counted(tmp_path):
     assert damage[0].numbers["places_count"] == 10
 
 
-def test_the_index_of_an_intact_bag_is_used(tmp_path):
-    messages = random_messages(8, count=50, types=TYPES, store=ROS1)
-    part = BagPart(write_bag(tmp_path / "run.bag", messages), "run.bag")
-    ((_, chunk),) = part.chunks_with(frozenset({0, 1}))
-    data, (entries, sound) = part.load(chunk), part.entries([chunk], np.array([chunk.size]))
-    assert sound.all()
-    assert len(entries.offset) == len(messages)
-
-    def borne_out(offset, entries):
-        return read_indexed_messages(Excerpt(data, offset, entries))[1]
-
-    assert borne_out(entries.offset, entries).all()
-    for wrong in (
-        replace(entries, log_time_ns=entries.log_time_ns + 1),
-        replace(entries, channel=1 - entries.channel),
-        replace(entries, end=entries.offset + 20),
-    ):
-        assert not borne_out(entries.offset, wrong).any()
-    assert not borne_out(entries.offset + 1, entries).any()
-    one_wrong = replace(entries, log_time_ns=entries.log_time_ns + (np.arange(len(messages)) == 20))
-    assert np.flatnonzero(~borne_out(entries.offset, one_wrong)).tolist() == [20]
-    part.close()
-
-
-def test_a_cut_chunk_of_an_unknown_compression_is_lost(tmp_path):
-    messages = random_messages(8, count=50, types=TYPES, store=ROS1)
-    path = write_bag(tmp_path / "run.bag", messages, BagWriter.CompressionFormat.LZ4)
-    data = path.read_bytes().replace(b"compression=lz4", b"compression=lz8")
-    path.write_bytes(data[: data.index(b"compression=lz8") + 500])
-    tables, damage = read(path)
-    assert tables == {}
-    assert "chunk-damaged" in {finding.code for finding in damage}
-
-
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe\0garbage: [", b"rosbag2_bagfile_information:\n", b"a: &a [*a]\n"])
 def test_a_broken_metadata_file_costs_nothing(tmp_path, content):
     messages = random_messages(4, count=20, types=TYPES)
@@ -253,41 +216,6 @@ def test_every_row_of_a_db3_is_a_message_or_counted_as_lost(tmp_path, column, va
             assert count_lost(log.findings) == {"record-damaged": 3}
 
 
-@pytest.mark.parametrize(
-    "head",
-    [
-        b"\0\1\6\x81\x80\x80\x80\x80\x80\x80\x80\0",
-        b"\0\1\6\x0b",
-        b"\0\1\5\x2c",
-        b"\0\1\6\xff",
-        b"\xff\xff\xff\x7f",  # endless: SQLite says that there is no memory for it
-    ],
-)
-def test_a_row_whose_head_contradicts_itself_costs_itself(tmp_path, head):
-    messages = random_messages(5, count=20, types=TYPES[1:])
-    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
-    data = path.read_bytes()
-    at = data.index(struct.pack(">q", messages[10].log_time_ns)) - 4  # a serial type for each column
-    at -= head[0] == 0xFF  # before them the size of the head
-    path.write_bytes(data[:at] + head + data[at + len(head) :])
-    with open_log(path) as log:
-        assert log.table("/ColorRGBA").num_rows == 19
-        assert log.damage
-
-
-def test_a_row_that_is_missing_from_its_pages_list_is_damage(tmp_path):
-    messages = random_messages(5, count=20, types=TYPES[1:])
-    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
-    with closing(sqlite3.connect(path)) as database:
-        root = database.execute("SELECT rootpage FROM sqlite_schema WHERE name = 'messages'").fetchone()[0]
-    data = bytearray(path.read_bytes())
-    data[(root - 1) * 4096 + 4] -= 1
-    path.write_bytes(data)
-    with open_log(path) as log:
-        assert log.table("/ColorRGBA").num_rows == 19
-        assert count_lost(log.findings) == {"database-damaged": None}
-
-
 def test_a_message_that_moves_to_another_topic_is_missed_by_metadata(tmp_path, messages):
     bag = write_rosbag2(tmp_path / "run", messages)
     with closing(sqlite3.connect(next(bag.glob("*.db3")))) as database, database:
@@ -316,34 +244,6 @@ def test_messages_of_channels_that_nothing_declares_are_counted(tmp_path, messag
     with open_log(path) as log:
         assert sum(table.num_rows for table in log.tables(log.topics).values()) == len(messages) - 1
         assert count_lost(log.findings)["channel-undeclared"] == 1
-
-
-def test_a_chunk_that_was_written_over_another_is_damage(tmp_path, messages):
-    options = {"compression": CompressionType.NONE, "index_types": IndexType.NONE}
-    path = write_mcap(
-        tmp_path / "a.mcap", [replace(m, payload=bytes(40)) for m in messages], chunk_bytes=700, **options
-    )
-    data = path.read_bytes()
-    sizes = {}
-    for start, end in chunks_of(path):
-        sizes.setdefault(end - start, []).append((start, end))
-    (one, one_end), (other, other_end) = next(places for places in sizes.values() if len(places) > 1)[:2]
-    path.write_bytes(data[:other] + data[one:one_end] + data[other_end:])
-    with open_log(path) as log:
-        assert count_lost(log.findings) == {"chunk-suspect": None}
-
-
-def test_a_bag_whose_index_names_a_chunk_twice_is_walked(tmp_path):
-    path = write_bag(tmp_path / "a.bag", random_messages(1, count=30, types=TYPES, store=ROS1), chunk_bytes=2000)
-    clean, _ = read(path)
-    data = path.read_bytes()
-    *_, before, last = [at for at in range(len(data)) if data.startswith(b"op=\x06", at)]
-    size = last - before
-    path.write_bytes(data[: last - 8] + data[before - 8 : before - 8 + size])
-    assert path.stat().st_size == len(data)
-    tables, damage = read(path)
-    assert count_lost(damage) == {"index-damaged": None}
-    assert all(stamps(tables, topic) == stamps(clean, topic) for topic in clean)
 
 
 @pytest.mark.parametrize("number", [0, 1, 77])

@@ -1,16 +1,11 @@
 """Piece by piece: the pieces are the tables, in order, none larger than asked."""
 
-import json
-
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from random_messages import (
     ROS1,
     ROS2,
-    START_NS,
     TYPES,
-    Message,
     random_messages,
     table_bytes,
     write_bag,
@@ -18,8 +13,7 @@ from random_messages import (
     write_rosbag2,
 )
 
-from tcpipe.formats.logs.log_file import Log, open_log
-from tcpipe.pipeline.export import export
+from tcpipe.formats.logs.log_file import open_log
 
 LIMIT_BYTES = 40_000
 WRITERS = {
@@ -76,25 +70,3 @@ def test_a_topic_of_few_messages_is_not_cut_into_crumbs(tmp_path):
         pieces = list(log.batches(log.topics, batch_bytes=30_000))
     assert sum("/Imu" in piece for piece in pieces) > 4
     assert [piece["/ColorRGBA"].num_rows for piece in pieces if "/ColorRGBA" in piece] == [40]
-
-
-def test_messages_that_fit_no_definition_leave_pieces_without_rows(tmp_path):
-    broken = [Message("/a", "std_msgs/msg/ColorRGBA", START_NS + n, b"\x00\x01\x00\x00\x01", None) for n in range(60)]
-    with open_log(write_mcap(tmp_path / "a.mcap", broken, chunk_bytes=512)) as log:
-        pieces = list(log.batches(["/a"], batch_bytes=500))
-        assert sum(piece["/a"].num_rows for piece in pieces) == 0
-        assert sum(finding.numbers["lost_messages_count"] for finding in log.findings) == 60
-
-
-def test_export_writes_the_tables_row_group_by_row_group(tmp_path, monkeypatch):
-    monkeypatch.setitem(Log.batches.__kwdefaults__, "batch_bytes", LIMIT_BYTES)
-    path = WRITERS["mcap"](tmp_path, made("mcap"))
-    exported = export(path, tmp_path / "out")
-    with open_log(path) as log:
-        tables = log.tables(log.topics)
-    assert {of.topic for of in exported.topics} == set(tables)
-    assert max(pq.read_metadata(of.path).num_row_groups for of in exported.topics) > 1
-    for of in exported.topics:
-        read = pq.read_table(of.path)
-        assert read.num_rows == of.messages == tables[of.topic].num_rows
-        assert json.dumps(read.to_pylist()) == json.dumps(tables[of.topic].to_pylist())

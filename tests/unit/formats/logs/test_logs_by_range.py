@@ -1,7 +1,6 @@
 """Logs in a bucket: what is fetched of them is counted; they are the same recording wherever they lie."""
 
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,12 +17,10 @@ from random_messages import (
     write_mcap,
 )
 from rosbags.rosbag1 import Writer as BagWriter
-from stored_files import flip
 from wheel_drives import drive_at
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.logs.log_part import FetchedFile
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe
@@ -102,17 +99,6 @@ def test_a_recording_is_one_run_wherever_it_lies(drives, tmp_path):
     assert len(inspect(store.root, recipe=Recipe()).runs) == 1
 
 
-def test_what_is_broken_in_one_copy_is_read_from_another(drives, tmp_path):
-    bucket, _ = drives
-    here = drive_at(tmp_path / "run.mcap")
-    flip(Path(shutil.copy(here, bucket / "run.mcap")))
-    store = tmp_path / "store"
-    (damaged,) = ingest(["s3://drives/run.mcap"], store=store, recipe=Recipe()).results
-    (whole,) = ingest([here], store=store, recipe=Recipe()).results
-    assert (damaged.status, whole.status) == ("damaged", "done")
-    assert damaged.run.run_id != whole.run.run_id
-
-
 @pytest.mark.parametrize("kind", ["cut", "chunkless"])
 def test_a_log_without_an_index_is_fetched_as_a_whole_and_hashed(drives, tmp_path, kind):
     bucket, _ = drives
@@ -125,13 +111,6 @@ def test_a_log_without_an_index_is_fetched_as_a_whole_and_hashed(drives, tmp_pat
         assert there.sha256() == here.sha256()
         assert there.outline == here.outline == ""
         assert not there.is_known_by_outline
-
-
-def test_an_index_tells_recordings_apart(tmp_path):
-    with open_log(drive_at(tmp_path / "a.mcap", seed=1)) as a, open_log(drive_at(tmp_path / "b.mcap", seed=2)) as b:
-        assert a.outline != b.outline
-        assert len(a.outline) == 64
-        assert not a.is_known_by_outline
 
 
 def test_a_connection_that_breaks_is_made_again_and_named_where_it_breaks_for_good(drives, monkeypatch):
@@ -155,41 +134,3 @@ def test_an_object_that_is_written_anew_while_it_is_read_is_refused(drives):
         (bucket / "run.mcap").write_bytes((bucket / "run.mcap").read_bytes()[:-1] + b"x")
         with pytest.raises(LogError, match=r"s3://drives/run.mcap: changed while it was read"):
             log.table(TOPIC)
-
-
-class Recorded:
-    """An object that counts what is asked for."""
-
-    def __init__(self, data):
-        self.data, self.spans = data, []
-
-    @property
-    def size_bytes(self):
-        return len(self.data)
-
-    def ranges(self, spans):
-        self.spans += spans
-        return [memoryview(self.data)[start:stop] for start, stop in spans]
-
-    def copy(self, to):
-        to.write_bytes(self.data)
-
-
-def test_pieces_of_a_file_are_fetched_once_and_forgotten_when_they_are_many(tmp_path):
-    stored = Recorded(np.random.default_rng(0).bytes(70 << 20))
-    file = FetchedFile(stored, tmp_path / "stand-in")
-    assert file.read(10_000, 20) == stored.data[10_000:10_020]
-    assert file.read(10_000, 30) == stored.data[10_000:10_030]
-    assert len(stored.spans) == 1
-    assert file.read(stored.size_bytes - 5, 10) == stored.data[-5:]
-    assert file.read(stored.size_bytes + 5, 10) == b""
-    file.expect([(1 << 20, 100), ((1 << 20) + 20_000, 100), (5 << 20, 100)])
-    assert [stop - start for start, stop in stored.spans[2:]] == [24_576, 8192]  # what lies near is one piece
-    before = len(stored.spans)
-    assert file.read((1 << 20) + 20_000, 100) == stored.data[(1 << 20) + 20_000 :][:100]
-    assert len(stored.spans) == before
-    assert file.read(0, 70 << 20) == stored.data
-    assert file.read(10_000, 20) == stored.data[10_000:10_020]
-    assert len(stored.spans) > before + 1
-    file.whole()
-    assert (tmp_path / "stand-in").read_bytes() == stored.data

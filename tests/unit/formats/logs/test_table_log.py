@@ -13,12 +13,9 @@ from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.table_log import open_tables
-from tcpipe.formats.recipe_toml import load_shipped_profiles, parse_toml
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.proposals import propose_recipe
 from tcpipe.recipe import Recipe, TableMapping
-from tcpipe.recipe.checking import from_values
 from tcpipe.simulation.scenarios import make_tiny
 from tcpipe.stages.read import find_read_config, read_run
 from tcpipe.tables.columns import to_floats, to_integers
@@ -171,47 +168,6 @@ def test_a_run_is_known_by_all_tables_of_its_folder_not_by_what_is_mapped(tmp_pa
     assert open_tables(folder, {"command": TableMapping("odom.csv", columns={"linear_x": "v"})}).sha256() == one
     (folder / "other.csv").write_text("t,a\n1,3\n")
     assert open_tables(folder, {"wheel_odometry": WHEELS}).sha256() != one
-
-
-def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_path):
-    def rows(cells):
-        places = 15.0 + 6.6e-7 * np.arange(50)  # 0.5 m/s to the east
-        return "".join(f"17604564{85 + k // 10}.{k % 10},{cells.format(k=k % 10, lon=places[k])}\n" for k in range(50))
-
-    folder = folder_with(
-        tmp_path,
-        odom="time,vx,yaw_rate\n" + rows("0.50{k},0.0"),
-        cmd_vel="stamp,linear.x,angular.z\n" + rows("0.5,0.0"),
-        imu="t,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z\n" + rows("0.{k},0.1{k},0.2{k},0.1{k},0.2,9.8{k}"),
-        fixes="t,Latitude (deg),Longitude (deg),height\n" + rows("47.0,{lon:.9f},400"),
-        voltage_left="timestamp,value\n" + rows("48.{k}"),
-        current_left="timestamp,value\n" + rows("4.{k}"),
-        notes="a,b,c\n1,2,3\n",
-    )  # fmt: skip
-    found = inspect(folder, recipe=Recipe())
-    assert found.kind == "tables"
-    assert "notes.csv, not used" in found.recipe
-    assert found.recipe == propose_recipe(folder).toml()
-    alone = inspect(folder / "fixes.csv", recipe=Recipe())
-    assert alone.recipe == propose_recipe(folder / "fixes.csv").toml()
-    recipe = from_values(Recipe, parse_toml(found.recipe), where="proposed")
-    assert {table.role or name for name, table in recipe.tables.items()} == {
-        "gnss",
-        "imu",
-        "wheel_odometry",
-        "command",
-        "power",
-    }
-    read = inspect(folder, recipe=recipe)
-    assert read.kind == "log"
-    assert {topic.name: topic.role for topic in read.topics} == {
-        "/gnss": "gnss",
-        "/imu": "imu",
-        "/wheel_odometry": "wheel_odometry",
-        "/command": "command",
-        "/voltage_left": "power",
-        "/current_left": "power",
-    }
 
 
 def test_a_store_inside_the_folder_of_tables_is_no_part_of_the_log(tmp_path):

@@ -1,6 +1,5 @@
 """Rasters of every convention on one grid, against closed forms; and rasters that cannot be placed, refused in one line."""
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import rasterio.shutil
 from map_worlds import World, write_tif
 from rasterio import Affine
 from rasterio.control import GroundControlPoint
-from shared_data import shared_data
 
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.building import build_map
@@ -336,13 +334,6 @@ def test_names_that_the_class_table_lacks_are_not_guessed(tmp_path, height):
     assert source.facts.classes_from == "file"
 
 
-def test_attribute_tables_without_names_or_with_ranges_leave_values_as_ids(tmp_path, height):
-    path = named_raster(tmp_path, {4: "", 5: ""})
-    _, source = built(tmp_path, height=height, terrain=path)
-    assert source.read("terrain", 5, 6, 0, 400)[0, 4::8].tolist() == [0, *range(1, 8), *[0] * 42]
-    assert source.facts.classes_from == "default"
-
-
 def test_palette_indices_are_class_values_and_what_is_transparent_is_nodata(tmp_path, height):
     index = np.repeat(np.array([4, 5, 6, 7], np.uint8), 100)[None, None, :].repeat(400, axis=1)
     write_tif(tmp_path / "p.tif", index, WORLD.crs, NORTH_UP)
@@ -357,18 +348,6 @@ def test_palette_indices_are_class_values_and_what_is_transparent_is_nodata(tmp_
     )  # keeps opacity, which a GeoTIFF does not
     _, source = built(tmp_path, height=height, terrain=tmp_path / "p.img")
     assert source.read("terrain", 9, 10, 0, 400)[0, 50::100].tolist() == [4, 5, 0, 7]
-
-
-def test_two_builds_are_the_same_bytes_and_replace_each_other(tmp_path):
-    paths = World("EPSG:32633", 560_000.0, 5_215_000.0, side_m=30.0).write(tmp_path, 0.1)
-
-    def digest():
-        built(tmp_path, **paths)
-        files = sorted(path for path in (tmp_path / "m.zarr").rglob("*") if path.is_file())
-        return [(path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files]
-
-    assert digest() == digest()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["height.tif", "m.zarr", "ortho.tif", "terrain.tif"]
 
 
 def test_shards_meet_without_a_seam(tmp_path):
@@ -444,12 +423,6 @@ def test_what_cannot_be_placed_is_refused_in_one_line_and_leaves_nothing(tmp_pat
         assert not list((tmp_path / "out").iterdir()), path
 
 
-def test_several_wrong_rasters_are_named_at_once(tmp_path, height):
-    with pytest.raises(MapError) as caught:
-        built(tmp_path, height=tmp_path / "no.tif", ortho=height, terrain=tmp_path / "no-terrain.tif")
-    assert len(caught.value.problems) == 3
-
-
 def test_a_wanted_crs_must_be_metric(tmp_path):
     write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), None, NORTH_UP)
     for crs, wanted in (("EPSG:3857", "not metric"), ("EPSG:4326", "not metric"), ("nonsense", "not a CRS")):
@@ -457,73 +430,3 @@ def test_a_wanted_crs_must_be_metric(tmp_path):
             built(tmp_path, height=tmp_path / "h.tif", crs=crs)
     _, source = built(tmp_path, height=tmp_path / "h.tif", crs="EPSG:32633")
     check_plane(source)
-
-
-ODDITIES = {
-    "Copernicus_DSM_10_N45_00_E005_00_DEM.tif": None,
-    "copernicus_status.tif": None,
-    "cog_nodata_nan.tif": None,
-    "float_raster_with_nodata.tif": None,
-    "201404_13SED190110_201404_0x1500m_CL_1.tif": "3 bands",
-    "RGBA.uint16.tif": "4 bands",
-    "cog_cmap.tif": "palette",
-    "cog_gcps.tif": "ground control points",
-    "cog_nonearth.tif": "another body",
-    "cog_scale.tif": "2 bands",
-    "dem_cm.tif": "not metres",
-    "float_nan.tif": "no CRS",
-    "inverted_lat.tif": "too large|nodata",
-    "rotated.tif": "no CRS",
-}
-
-
-@pytest.mark.parametrize("name", ODDITIES)
-def test_odd_rasters_of_others_as_height(tmp_path, name):
-    path, wanted = shared_data(f"rasters/{name}"), ODDITIES[name]
-    if wanted is None:
-        _, source = built(tmp_path, height=path)
-        assert source.grid.crs.startswith("EPSG:326")
-    else:
-        with pytest.raises(MapError, match=wanted) as caught:
-            built(tmp_path, height=path)
-        assert len(caught.value.problems) == 1
-
-
-ORTHOS = {
-    "201404_13SED190110_201404_0x1500m_CL_1.tif": (None, 1.0),
-    "201404_13SED190110_201404_0x1500m_CL_1_alpha.tif": (None, 0.93),
-    "201404_13SED190110_201404_0x1500m_CL_1_mask.tif": (None, 0.97),
-    "201404_13SED190110_201404_0x1500m_CL_1_nodata.tif": (None, 0.97),
-    "OSBS_029.tif": (None, 0.99),
-    "RGBA.uint16.tif": (None, 0.5),
-    "all-nodata.tif": ("no data anywhere", 0.0),
-    "corrupt.tif": ("damaged", 0.0),
-}
-
-
-@pytest.mark.parametrize("name", ORTHOS)
-def test_odd_rasters_of_others_as_ortho(tmp_path, name):
-    """A flat height raster is laid under each."""
-    path, (wanted, covered) = shared_data(f"rasters/{name}"), ORTHOS[name]
-    with rasterio.open(path) as dataset:
-        crs, (left, bottom, right, top) = dataset.crs, dataset.bounds
-    affine = Affine((right - left) / 50, 0.0, left, 0.0, -(top - bottom) / 50, top)
-    flat = write_tif(tmp_path / "flat.tif", np.full((1, 50, 50), 100.0, np.float32), crs, affine)
-    if wanted:
-        with pytest.raises(MapError, match=wanted):
-            built(tmp_path, height=flat, ortho=path)
-        return
-    summary, _ = built(tmp_path, height=flat, ortho=path)
-    assert summary.covered["ortho"] >= 0.93 * covered
-
-
-def test_the_map_of_a_real_site(tmp_path):
-    site = shared_data("warthog_grass_a")
-    layers = {name: site / f"{name}.tif" for name in ("height", "ortho", "terrain")}
-    _, source = built(tmp_path, **layers)
-    assert (source.grid.crs, source.grid.pixel_size_m, source.grid.rows) == ("EPSG:32750", 0.25, 400)
-    with rasterio.open(layers["height"]) as dataset:
-        original = dataset.read(1, masked=True)
-    np.testing.assert_allclose(heights(source), original.filled(np.nan), atol=1e-5)
-    with rasterio.open(layers["terrain"]) as dataset:
-        np.testing.assert_array_equal(source.read("terrain", 0, 400, 0, 400), dataset.read(1))

@@ -108,14 +108,6 @@ def test_a_map_of_too_many_pixels_is_refused_before_one_is_read(tmp_path, rows, 
     assert len(caught.value.problems) == 1
 
 
-def test_a_layer_so_fine_that_the_map_would_be_huge_is_refused(tmp_path):
-    height = write_tif(tmp_path / "h.tif", np.ones((1, 100, 100), np.float32), "EPSG:32633", SMALL)
-    fine = Affine(1e-7, 0.0, 560_000.0, 0.0, -1e-7, 5_215_000.0)
-    ortho = write_tif(tmp_path / "o.tif", np.ones((1, 9, 9), np.uint8), "EPSG:32633", fine)
-    with pytest.raises(MapError, match="the map would have"):
-        build_map(tmp_path / "m.zarr", name="m", height=height, ortho=ortho)
-
-
 def test_a_map_that_is_mostly_empty_is_made_of_what_it_has(tmp_path):
     path = sparse(tmp_path / "h.tif", 5000, 5000, 0.05)
     with rasterio.open(path, "r+") as dataset:

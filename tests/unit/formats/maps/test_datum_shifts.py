@@ -6,7 +6,6 @@ import rasterio
 from map_worlds import World, write_tif
 from rasterio import Affine
 from rasterio.warp import transform
-from shared_data import shared_data
 
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.building import build_map
@@ -112,17 +111,3 @@ def test_a_known_crs_keeps_the_datum_of_its_authority():
 def test_a_shift_in_a_grid_file_is_refused_with_the_command_that_applies_it():
     with pytest.raises(MapError, match=r"grid file 'shift.gsb'.*rio warp in.tif out.tif --dst-crs EPSG:n"):
         parse_crs("+proj=utm +zone=33 +ellps=bessel +nadgrids=shift.gsb", where="h.tif")
-
-
-def test_the_reported_raster_lies_on_its_sound_twin(tmp_path):
-    """The report was 103 m off."""
-    maps = {}
-    for name in ("good_height", "towgs84_height"):
-        build_map(tmp_path / name, name="m", height=shared_data(f"reports/maps/{name}.tif"))
-        maps[name] = open_map(tmp_path / name)
-    centres = []
-    for source in maps.values():
-        x_min, y_min, x_max, y_max = source.grid.bounds_m
-        middle = np.array([[(x_min + x_max) / 2.0, (y_min + y_max) / 2.0]])
-        centres.append(find_map_projection(source, "EPSG:4326").inverse(middle))
-    np.testing.assert_allclose(*centres, atol=2e-6)

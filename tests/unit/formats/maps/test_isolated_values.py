@@ -7,7 +7,6 @@ from map_worlds import write_tif
 from rasterio import Affine
 from shared_data import shared_data
 
-from tcpipe.errors import MapError
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.tables.findings import select_findings
@@ -54,17 +53,6 @@ def test_a_height_far_below_all_others_is_reported_and_a_tag_makes_it_no_data(tm
     source, left = add(tmp_path, height=path)
     assert not left
     assert np.array_equal(np.isnan(read(source, "height")), place)
-
-
-def test_one_of_several_tiles_has_the_hole(tmp_path):
-    paths = [write(tmp_path / "a.tif", np.where(HOLE, 0.0, HEIGHT))]
-    with rasterio.open(paths[0]) as dataset:
-        beside = dataset.transform @ Affine.translation(COUNT, 0)
-    paths.append(
-        write_tif(tmp_path / "b.tif", (HEIGHT + 0.2 * COUNT * PX).astype(np.float32)[None], "EPSG:32633", beside)
-    )
-    _, (finding,) = add(tmp_path, height=paths)
-    assert finding.names["value"] == "0"
 
 
 def test_a_hole_with_smeared_edges_is_reported(tmp_path):
@@ -115,11 +103,6 @@ def test_few_grey_levels_are_reported(tmp_path, highest, nodata):
     _, (finding,) = add(tmp_path, **photo(tmp_path, values, np.uint16, nodata=nodata))
     assert finding.code == "ortho-range-narrow"
     assert finding.numbers["range_fraction"] < 0.25
-
-
-def test_reflectance_as_floats_is_refused(tmp_path):
-    with pytest.raises(MapError, match="float32, expected 8-bit or 16-bit"):
-        add(tmp_path, **photo(tmp_path, GREY / 255.0, np.float32))
 
 
 @pytest.mark.parametrize(

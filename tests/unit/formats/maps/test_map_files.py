@@ -6,7 +6,6 @@ import shutil
 import numpy as np
 import pyproj
 import pytest
-import rasterio
 import xarray
 from map_worlds import World
 from stored_files import flip
@@ -51,22 +50,6 @@ def test_xarray_decodes_metres_grey_and_classes_with_coordinates(path):
         assert found.height.attrs["units"] == "m"
         assert found.terrain.attrs["flag_meanings"].split()[3:] == ["grass", "mud", "unpaved_road", "paved_road"]
         assert found.height.attrs["grid_mapping"] == "spatial_ref"
-
-
-@pytest.mark.skipif(
-    tuple(int(part) for part in rasterio.__gdal_version__.split(".")[:2]) < (3, 13),
-    reason=f"GDAL reads shards from 3.13 on; rasterio brings {rasterio.__gdal_version__}",
-)
-def test_gdal_opens_each_layer_in_its_place(path):
-    grid = open_map(path).grid
-    for layer in ("height", "terrain"):
-        with rasterio.open(f'ZARR:"{path}":/{layer}') as found:
-            assert pyproj.CRS(found.crs.to_wkt()) == pyproj.CRS(WORLD.crs)
-            assert found.transform.to_gdal() == pytest.approx(grid.geotransform)
-            values = found.read(1) * found.scales[0] + found.offsets[0]
-        x, y = np.meshgrid(*(grid.xy_from_px(np.stack([np.arange(200.0)] * 2, 1)).T))
-        wanted = WORLD.height(x, y) if layer == "height" else WORLD.terrain(x, y)
-        np.testing.assert_allclose(values, wanted, atol=1e-4)
 
 
 def test_overviews_are_maps_of_the_same_ground(path):

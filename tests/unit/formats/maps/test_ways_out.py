@@ -15,7 +15,6 @@ from rasterio import Affine
 from rasterio.control import GroundControlPoint
 from rasterio.features import shapes
 from rasterio.warp import transform_geom
-from shared_data import shared_data
 
 from tcpipe.errors import MapError, RegionError
 from tcpipe.formats.geojson import read_regions
@@ -111,13 +110,6 @@ def test_complex_numbers_are_one_line_with_a_command(tmp_path, dtype):
     assert np.unique(read_heights(build(tmp_path, height=tmp_path / "out.tif"))).tolist() == [601.0]
 
 
-def test_colours_are_no_classes(tmp_path, site):
-    with rasterio.open(site["terrain"]) as dataset:
-        bands = np.repeat(dataset.read(), 3, axis=0)
-    terrain = write_tif(tmp_path / "rgb.tif", bands, WORLD.crs, TOP_LEFT, photometric="RGB")
-    assert "convert each colour to a value" in refuse(tmp_path, height=site["height"], terrain=terrain)
-
-
 @pytest.mark.parametrize(
     ("unit", "metres"),
     [
@@ -208,28 +200,6 @@ def test_a_region_wider_than_a_site_is_refused_and_the_maps_outline_is_one(tmp_p
     assert read_regions(region).train_test.area > 0.0
 
 
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("terrain_engineering_crs.tif", {"crs": "EPSG:32633"}),
-        ("terrain_float32.tif", {}),
-        ("terrain_null.geojson", {}),
-        ("terrain_shapes8.geojson", {}),
-    ],
-)
-def test_reported_files_are_read(tmp_path, name, options):
-    folder = shared_data("reports/maps")
-    source = build(
-        tmp_path,
-        height=folder / "good_height.tif",
-        terrain=folder / name,
-        agreed=None,
-        classes=folder / "classes.csv",
-        **options,
-    )
-    assert source.facts.class_share
-
-
 def test_a_raster_of_control_points_is_rectified(tmp_path):
     corners = [(0, 0), (0, 50), (50, 0), (50, 50)]
     points = [GroundControlPoint(row, col, WORLD.x_m + 0.2 * col, WORLD.y_m - 0.2 * row) for row, col in corners]
@@ -273,9 +243,3 @@ def test_tiles_that_differ_are_made_alike(tmp_path, what):
     found = read_heights(build(tmp_path, height=[made] if what == "pixels" else [*tiles[:2], made]))
     assert np.unique(found[np.isfinite(found)]).tolist() == [300.0]
     assert 0.2 < np.isnan(found).mean() < 0.3
-
-
-def test_a_virtual_raster_is_rewritten_by_the_command(tmp_path, site):
-    rasterio.shutil.copy(site["height"], tmp_path / "h.vrt", driver="VRT")
-    run_rio(refuse(tmp_path, height=tmp_path / "h.vrt"), tmp_path)
-    assert read_heights(build(tmp_path, height=tmp_path / "h.tif")).mean() == pytest.approx(612.0, abs=1.0)
