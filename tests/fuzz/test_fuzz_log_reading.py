@@ -16,6 +16,8 @@ TARGETS = fuzz_log_reading.TARGETS
 
 CHANGES = 8
 """Changed copies of each input of a corpus."""
+
+
 def changed(data, rng):
     """Flip, overwrite, cut, double or insert some bytes."""
     held = bytearray(data)
@@ -42,5 +44,3 @@ def test_inputs_and_changed_inputs_break_nothing(name):
         target.read(data)
         for _ in range(CHANGES):
             target.read(changed(data, rng))
-
-
