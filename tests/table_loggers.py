@@ -1,4 +1,4 @@
-"""Five invented loggers that write tables of one drive, each with names, units and clocks of its own, and the truth to judge labels by."""
+"""Four invented loggers that write tables of one drive, each with names, units and clocks of its own, and the truth to judge labels by."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,7 +16,6 @@ START_NS = round(START.timestamp() * 1000) * 1_000_000
 COURSE_RAD, LATITUDE, LONGITUDE = 0.5, 47.0612, 15.4481
 METRES_PER_DEG = 111_195.0
 GRAVITY = 9.80665
-WHEEL_RADIUS_M = 0.165
 Columns = dict[str, np.ndarray]
 
 
@@ -74,8 +73,7 @@ class Drive:
     def judge(self, segments: object) -> tuple[int, float, float]:
         """Return the number of segments, and the shares of their durations and energies within 2σ of the truth."""
         start = (to_integers(segments, "start_ns") - to_integers(segments, "start_ns")[0]) / 1e9
-        first = to_integers(segments, "start_ns")[0]
-        begin = (first - START_NS) / 1e9 if abs(first - START_NS) < 3600e9 else first / 1e9 - COUNTER_START_S
+        begin = (to_integers(segments, "start_ns")[0] - START_NS) / 1e9
         distance = np.interp(begin + start, self.t, self.distance)
         moving = np.concatenate(([True], np.diff(self.distance) > 0))
         end = np.interp(distance + 1.0, self.distance[moving], self.t[moving])
@@ -91,10 +89,6 @@ class Drive:
             for name, unit in (("duration", "s"), ("energy", "joule"))
         ]
         return len(start), float(shares[0]), float(shares[1])
-
-
-COUNTER_START_S = 41.5
-"""Reading of counters since power-on when the log begins."""
 
 
 def format_local(t: np.ndarray, form: str) -> list[str]:
@@ -129,27 +123,6 @@ def write_german(drive: Drive, folder: Path) -> None:
         "Ibat [mA]": 1000 * rows["amp"],
     }
     write_text(folder / "Messfahrt.csv", columns, separator=";", comma=True, encoding="cp1252")
-
-
-def write_microcontroller(drive: Drive, folder: Path) -> None:
-    """Write one table on a counter since power-on beside whole seconds of GNSS time; g, deg/s, revolutions per minute and mA."""
-    rows = drive.sample(50)
-    utc = (START_NS + np.round(rows["t"] * 1e9).astype(np.int64)) // 10**9
-    per_minute = 30 / np.pi / WHEEL_RADIUS_M
-    columns = {
-        "millis": np.round(1000 * (rows["t"] + COUNTER_START_S)).astype(np.int64),
-        "gps_time": pl.from_epoch(pl.Series(utc)).dt.strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "lat": rows["latitude"],
-        "lon": rows["longitude"],
-        "alt": rows["altitude"],
-        **{f"a{axis}[g]": rows[f"acc_{axis}"] / GRAVITY for axis in "xyz"},
-        **{f"g{axis}[dps]": np.degrees(rows[f"gyro_{axis}"]) for axis in "xyz"},
-        "rpm_L": per_minute * rows["left"],
-        "rpm_R": per_minute * rows["right"],
-        "Voltage [V]": rows["volt"],
-        "current_mA": 1000 * rows["amp"],
-    }
-    write_text(folder / "log7.csv", columns)
 
 
 VESC_ZEROS = (
@@ -245,7 +218,6 @@ class Logger:
 
 LOGGERS = {
     "german": Logger(write_german, "Messfahrt.csv", {"stamp_zone": '"Europe/Vienna"'}),
-    "microcontroller": Logger(write_microcontroller, "log7.csv", {}),
     "vesc_tool": Logger(write_vesc_tool, "2025-07-09_14-03-12.csv", {"stamp_zone": '"Europe/Vienna"'}),
     "french": Logger(write_french, ".", {"stamp_zone": '"Europe/Vienna"'}),
     "spanish": Logger(write_spanish, ".", {}),

@@ -14,7 +14,6 @@ from synthetic_store import WORLD, box, lonlat, region_file, small_store
 from tcpipe.dataset import open_dataset
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import DatasetConfig, Recipe
-from tcpipe.store import open_store
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 REGION = box(-20, -20, 5, 20)
@@ -48,10 +47,6 @@ def files(directory):
     return {
         path.relative_to(directory).as_posix(): path.read_bytes() for path in directory.rglob("*") if path.is_file()
     }
-
-
-def shards(built, split):
-    return str(built / "parquet" / "data" / f"{split}-*.parquet")
 
 
 def ends_xy(samples):
@@ -193,21 +188,6 @@ def test_mlcroissant_finds_nothing_wrong_and_reads_every_sample(built, samples, 
         assert [row[f"samples/{column}"] for row in rows] == samples[column].to_pylist(), column
 
 
-@not_ours
-def test_mlcroissant_reads_every_patch_of_the_shards(built):
-    mlc = pytest.importorskip("mlcroissant", reason="mlcroissant is not installed")
-    dataset = mlc.Dataset(jsonld=str(built[0] / "parquet" / "croissant.json"))
-    rows = {row["patches/sample_id"].decode(): row for row in dataset.records(record_set="patches")}
-    mine = open_dataset(built[0] / "parquet")
-    assert len(rows) == sum(len(part) for part in mine.values())
-    for split, part in mine.items():
-        layers = part.layers(np.arange(len(part)))
-        for number, sample_id in enumerate(part.samples["sample_id"].to_pylist()):
-            assert rows[sample_id]["patches/split"].decode() == split
-            for layer, pixels in layers.items():
-                assert np.array_equal(rows[sample_id][f"patches/{layer}"], pixels[number].reshape(-1))
-
-
 def test_the_croissant_document_says_where_patches_are_and_how_large(built):
     document = json.loads((built[0] / "parquet" / "croissant.json").read_text())
     assert (document["license"], document["creator"]["name"]) == ("CC-BY-4.0", "somebody")
@@ -217,27 +197,6 @@ def test_the_croissant_document_says_where_patches_are_and_how_large(built):
     assert {field.get("arrayShape") for field in patches["field"][2:]} == {"1600"}
     assert samples["key"] == {"@id": "samples/sample_id"}
     assert len(json.loads((built[0] / "zarr" / "croissant.json").read_text())["recordSet"]) == 1
-
-
-def test_hugging_face_datasets_reads_the_shards_as_they_are(built, samples, tmp_path):
-    datasets = pytest.importorskip("datasets", reason="datasets is not installed")
-    files = {split: shards(built[0], split) for split in SPLITS}
-    found = datasets.load_dataset("parquet", data_files=files, cache_dir=str(tmp_path))
-    for split, part in open_dataset(built[0] / "zarr").items():
-        assert found[split]["sample_id"][:] == part.samples["sample_id"].to_pylist()
-        heights = np.array(found[split].with_format("numpy")["height"][:])
-        assert np.array_equal(heights.reshape(-1, 40, 40), part.layers(np.arange(len(part)))["height"])
-
-
-def test_duckdb_reads_the_shards_as_they_are(built, samples):
-    duckdb = pytest.importorskip("duckdb", reason="duckdb is not installed")
-    for split, part in open_dataset(built[0] / "zarr").items():
-        rows = duckdb.sql(f"SELECT sample_id, split, power_watt, terrain FROM '{shards(built[0], split)}'").fetchall()  # noqa: S608
-        assert [row[0] for row in rows] == part.samples["sample_id"].to_pylist()
-        assert {row[1] for row in rows} == {split}
-        assert [row[2] for row in rows] == part.samples["power_watt"].to_pylist()
-        terrain = part.layers(np.arange(len(part)))["terrain"]
-        assert np.array_equal(np.array([row[3] for row in rows]), terrain.reshape(len(rows), -1))
 
 
 def test_every_file_of_samples_tells_where_its_rows_lie(built, samples):
@@ -252,15 +211,3 @@ def test_every_file_of_samples_tells_where_its_rows_lie(built, samples):
         assert (geo["version"], column["encoding"], column["geometry_types"]) == ("1.1.0", "WKB", ["Point"])
         there = shapely.from_wkb(pq.read_table(path, columns=["geometry"])["geometry"].to_pylist())
         assert column["bbox"] == shapely.total_bounds(there).tolist()
-
-
-def test_geopandas_reads_samples_and_segments(built, samples):
-    geopandas = pytest.importorskip("geopandas", reason="geopandas is not installed")
-    points = geopandas.read_parquet(built[0] / "zarr" / "samples.parquet")
-    assert points.crs.to_string() == "OGC:CRS84"
-    assert points.geometry.geom_type.unique().tolist() == ["Point"]
-    (path, *_) = (run.file("segments.parquet") for run in open_store(built[0] / "store").runs())
-    lines = geopandas.read_parquet(path)
-    assert lines.geometry.geom_type.unique().tolist() == ["LineString"]
-    metres = lines.geometry.to_crs(lines.estimate_utm_crs()).length
-    np.testing.assert_allclose(metres, lines["chord_m"], rtol=1e-3)  # the scale of a UTM zone

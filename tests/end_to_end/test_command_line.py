@@ -3,7 +3,6 @@
 import itertools
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -13,7 +12,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -27,9 +25,7 @@ from stored_files import checksums, map_path, only_run, tables
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.simulation import Faults, SimulatedSite, make_tiny, simulate
 from tcpipe.simulation.scenarios import RasterSpec
-from tcpipe.stages.read import read_run
 from tcpipe.store import Store, open_store
-from tcpipe.tables.levels import Streams
 
 _SECONDS = (32.0, 17.0, 17.0)
 
@@ -170,25 +166,16 @@ def test_what_is_no_log_is_said_in_plain_lines(kind: str, code: int, tmp_path: P
         (["ingest", "LOG", "--nosuch"], "No such option", 2),
         (["nosuch"], "No such command", 2),
         (["ingest", "LOG", "--store", ""], "is a variable not set?", 2),
-        (["ingest", "LOG", "--store="], "is a variable not set?", 2),
         (["ingest", "LOG", "--tag", "=wet"], "expected KEY=VALUE", 2),
         (["ingest", "LOG", "--robot", "nosuch"], "robot 'nosuch' is not known", 2),
         (["ingest", "LOG", "--recipe", "none.toml"], "there is no such file", 2),
-        (
-            ["ingest", "LOG", "--store", "https://x.org/store"],
-            "expected a directory, s3://bucket/name, gs:// or az://",
-            2,
-        ),
         (["ingest", "LOG", "--store", "LOG"], "is a file, expected a directory", 2),
-        (["ingest", "LOG", "--store", "LOG/below"], "is a file, expected a directory", 2),
         (["build-dataset", "--store", "nosuch"], "there is no store here", 2),
         (["inspect", "nosuch"], "there is no such file", 2),
-        (["report", "nosuch"], "there is no such file or directory", 2),
         (["export", "LOG", "out", "--topics", "/nosuch"], "topic /nosuch is not in this log", 1),
         (["export", "LOG", "LOG/below"], "is a file, expected a directory", 2),
         (["simulate", "out", "--scenario", "nosuch"], "scenario 'nosuch' is unknown", 2),
         (["simulate", ".."], "is not this simulated site", 2),
-        (["init", "LOG"], "is a file, expected a directory", 2),
         (["add-map", "m", "--height", "LOG"], "not a raster", 1),
     ],
 )
@@ -206,14 +193,6 @@ def test_what_cannot_be_done_is_one_line_and_an_exit_code(
         assert answer["exit_code"] == code
         assert said in answer["problems"][0]
     assert not any(path.is_file() for path in here.rglob("*"))
-
-
-def test_every_wrong_key_of_a_recipe_found_upward_is_named(log: Path, tmp_path: Path) -> None:
-    (tmp_path / "a" / "b").mkdir(parents=True)
-    (tmp_path / "tcpipe.toml").write_text("[fuse]\nfoo = 1\n[mask]\nbar = 2\n[segment]\nchord_m = -1\n")
-    told = plain_lines(tcpipe("ingest", log, cwd=tmp_path / "a" / "b"), 2)
-    assert str(tmp_path / "tcpipe.toml") in told
-    assert all(key in told for key in ("fuse.foo", "mask.bar", "segment.chord_m"))
 
 
 def test_a_raster_without_crs_and_a_map_that_is_there(sites: list[SimulatedSite], tmp_path: Path) -> None:
@@ -330,26 +309,6 @@ def test_power_logged_apart_is_one_drive(log: Path, store: Path, tmp_path: Path)
     assert "the same recording as" in plain_lines(twice, 1, most=1)
 
 
-def test_a_log_that_is_still_written_is_not_taken_for_whole(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    growing = tmp_path / "growing.mcap"
-    shutil.copy(log, growing)
-
-    def grow(*arguments: Any, **options: Any) -> Streams:
-        with growing.open("ab") as end:
-            end.write(b"more")
-        return read_run(*arguments, **options)
-
-    monkeypatch.setattr("tcpipe.stages.read.read_run", grow)
-    done = tcpipe("ingest", growing, "--json", "--quiet", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    (result,) = told(done)["results"]
-    assert result["status"] == "waiting"
-    assert "changed during the check" in result["notes"][0]
-    assert not list(tmp_path.glob("tcpipe-store/runs/*"))
-
-
 # --- where things are found and kept --------------------------------------------------------------------------------
 
 
@@ -371,36 +330,6 @@ def test_tags_are_kept_and_changed_without_doing_the_work_again(log: Path, store
     assert segments.stat().st_mtime_ns == made
     run = only_run(tmp_path / "tcpipe-store")
     assert run.manifest.tags == run.facts.tags == {"weather": "dry", "driver": "x"}
-
-
-def test_a_place_without_home_and_with_nothing_writable_but_the_store(logs: list[Path], tmp_path: Path) -> None:
-    env = {"HOME": "/proc", "NUMBA_CACHE_DIR": "/proc/none"}
-    done = subprocess.run(
-        [COMMAND, "ingest", logs[1]],
-        cwd=tmp_path,
-        env=env,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=HANGS_S,
-    )
-    assert done.returncode == 0, done.stderr
-
-
-def test_a_full_disk_leaves_nothing_half_written(log: Path, tmp_path: Path) -> None:
-    """A limit on the size of files stands for a full disk: the write itself fails."""
-    done = subprocess.run(
-        [COMMAND, "ingest", log, "--quiet"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000)),
-    )
-    told = plain_lines(done, 1, most=1)
-    assert "cannot be written (File too large)" in told
-    assert str(log) in told
-    assert _list_payload(tmp_path) == set()
 
 
 # --- looking at what is there ---------------------------------------------------------------------------------------

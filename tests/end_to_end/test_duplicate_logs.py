@@ -49,16 +49,6 @@ def test_one_drive_in_an_mcap_and_a_trimmed_bag_counts_once(drive, tmp_path):
     assert finding.numbers["duplicate_count"] >= finding.numbers["segment_count"] - 1
 
 
-def test_two_robots_side_by_side_are_two_drives(drive, tmp_path):
-    write_mcap(tmp_path / "a.mcap", drive.messages)
-    write_mcap(tmp_path / "b.mcap", drive.changed("gnss", move_east).messages)
-    assert ingest([tmp_path / "a.mcap", tmp_path / "b.mcap"], store=tmp_path / "store").exit_code in (0, 3)
-    found = take(Store(tmp_path / "store"))
-    assert len(found.runs) == 2
-    assert found.findings == ()
-    assert not any(again.any() for again in found.again.values())
-
-
 def test_each_answer_to_the_question_works_when_it_is_typed(drive, tmp_path):
     """Two receivers of one drive, on computers that share no sensor, cannot be distinguished from two robots."""
     logs = [tmp_path / "a.mcap", tmp_path / "b.mcap"]

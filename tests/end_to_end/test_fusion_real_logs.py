@@ -66,15 +66,6 @@ def test_husky_with_an_imu_mounted_on_its_side_and_sbas():
     assert track.info.report.facts.fuse.stretches[0].heading_from == "course over ground"
 
 
-@pytest.mark.parametrize("name", ["robot_localization/test2.bag", "robot_localization/test1_2014.bag"])
-def test_logs_without_gnss_give_a_local_track(name):
-    _, track = fused(name)
-    assert track.info.datum is None
-    assert track.table.num_rows > 1000
-    assert np.isfinite(to_floats(track.table, "x_m")).all()
-    assert "no-gnss" in {of.code for of in track.info.report.findings}
-
-
 def test_a_metre_of_the_wheels_stays_one_where_nothing_else_tells_it():
     streams, track = fused("robot_localization/test2.bag")
     wheels = streams.tables["wheel_odometry"]

@@ -108,24 +108,6 @@ def faulty(tmp_path_factory):
     return run(simulate(tmp_path_factory.mktemp("faulty"), scenario=plan, seed=4))
 
 
-def own_std(labelled, quantity, unit):
-    """Return the standard deviation less its common part: gain and zero of the simulated power sensor are right."""
-    total, shared = (to_floats(labelled.table, f"{quantity}_{part}_{unit}") for part in ("std", "common_std"))
-    return np.sqrt(total**2 - shared**2)
-
-
-def test_labels_are_as_wrong_as_they_say(faulty):
-    _, labelled, truth = faulty
-    true = compute_true_cost(truth, to_integers(labelled.table, "start_ns"))
-    for name in ("duration_s", "velocity_mps", "power_watt", "energy_joule"):
-        quantity, unit = name.rsplit("_", 1)
-        error = to_floats(labelled.table, name) - getattr(true, name)
-        assert np.abs(error).sum() < 0.015 * np.abs(getattr(true, name)).sum()
-        normalized = error / own_std(labelled, quantity, unit)
-        assert len(normalized) > 80
-        assert 0.5 < np.sqrt(np.mean(normalized**2)) < 1.5, name
-
-
 def spans(labelled):
     return tuple(to_integers(labelled.table, name) for name in ("start_ns", "end_ns"))
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from changed_drives import NAMES, Drive, energy_ratio, make
+from changed_drives import NAMES, energy_ratio, make
 from click.testing import CliRunner
 
 from tcpipe.cli import cli
@@ -188,19 +188,3 @@ def test_a_recipe_settles_what_inspect_and_preflight_propose(drive, tmp_path):
         assert "at [0.1, 0.0, 0.2] m (recipe)" in output
         proposed = output.partition("These need no line.")[2]
         assert re.findall(r"^# (\w+) = ", proposed, flags=re.MULTILINE) == ["gnss"]
-
-
-def test_currents_of_motors_are_for_a_person_to_decide(drive, tmp_path):
-    stamp_ns, volt, amp, right = power_at(drive)
-    definition = "std_msgs/Header header\nuint16 bus_mv\nint32[2] motors_ma\n"
-    milliamps = (1000 * np.stack([amp * right, amp * (1 - right)], 1)).astype(np.int32)
-    columns = stamped(stamp_ns, bus_mv=(1000 * volt).astype(np.uint16), motors_ma=milliamps)
-    own = MessageStream("/rover/motors", "rover_msgs/msg/Motors", stamp_ns, columns, definition=definition)
-    write_mcap(tmp_path / "run.mcap", [*Drive(drive.truth, drive.messages).without("power").messages, own])
-    run("init", tmp_path, "--from", tmp_path / "run.mcap")
-    (line,) = (of for of in (tmp_path / "tcpipe.toml").read_text().splitlines() if "power_sources" in of)
-    assert line.startswith("# power_sources = ")
-    (source,) = parse_toml(line.removeprefix("# "))["power_sources"]
-    given = {name: source[name] for name in ("voltage", "voltage_scale", "current", "current_scale")}
-    assert given == {"voltage": "bus_mv", "voltage_scale": 0.001, "current": "motors_ma[]", "current_scale": 0.001}
-    assert "motor" in line.partition("#")[2].partition("#")[2]

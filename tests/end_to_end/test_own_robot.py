@@ -9,8 +9,7 @@ from mcap.writer import Writer
 from simulated_streams import log_of, streams_of
 from stored_files import manifest
 
-from tcpipe.errors import DatasetError, UsageError
-from tcpipe.formats.recipe_toml import load_recipe
+from tcpipe.errors import DatasetError
 from tcpipe.pipeline.dataset.runs import choose_runs
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.recipe import Recipe
@@ -112,20 +111,3 @@ def test_another_voltage_range_is_another_run(drive, tmp_path):
     ]
     assert not flagged[0].any()
     assert flagged[1].any()
-
-
-def test_two_robots_of_a_recipe_are_not_pooled_unasked(drive, tmp_path):
-    log, battery, recipe = drive
-    two = tmp_path / "two.toml"
-    two.write_text(recipe.read_text() + "\n[robots.rover]\nmax_velocity_mps = 1.0\n")
-    for robot in ("scout", "rover"):
-        ingest([log, battery], store=tmp_path / "store", recipe=two, robot=robot, as_one=True)
-    with pytest.raises(DatasetError, match="runs of 2 robots \\(rover, scout\\)"):
-        choose(tmp_path / "store", load_recipe(two), None)
-    assert {run.facts.robot for run in choose(tmp_path / "store", load_recipe(two), "rover").runs} == {"rover"}
-
-
-def test_a_name_that_neither_the_recipe_nor_the_package_has(drive, tmp_path):
-    log, _, recipe = drive
-    with pytest.raises(UsageError, match="known: dingo, generic, husky, husky_a300, jackal, ridgeback, scout, warthog"):
-        ingest([log], store=tmp_path / "store", recipe=recipe, robot="scuot")

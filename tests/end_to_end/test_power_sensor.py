@@ -98,7 +98,7 @@ def test_a_fault_is_named_and_labels_are_no_more_wrong_than_they_say(drive, faul
         assert np.mean(np.abs(normalized(drive, labelled, name)) < 2.0) >= 0.92, name
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.2, 0.36, 0.6])
+@pytest.mark.parametrize("delay_s", [0.0, 0.2, 0.6])
 def test_the_delay_of_power_is_in_the_uncertainty(drive, delay_s):
     stamp_ns = to_integers(drive[0].tables["power"], "stamp_ns")
     share = delay_s / ((stamp_ns[-1] - stamp_ns[0]) * 1e-9)

@@ -43,9 +43,8 @@ def test_slopes_confirm_a_sound_run(drive, tmp_path):
     assert read_energy_line(result).endswith("J/m · confirmed by: slope (to a factor of three) · usable")
 
 
-@pytest.mark.parametrize("factor", [0.1, 100.0])
-def test_a_wrong_unit_is_not_usable_until_the_printed_line_corrects_it(drive, tmp_path, factor):
-    result, found = ingest_drive(scale(drive, "power", factor, "measured_currents"), tmp_path)
+def test_a_wrong_unit_is_not_usable_until_the_printed_line_corrects_it(drive, tmp_path):
+    result, found = ingest_drive(scale(drive, "power", 0.1, "measured_currents"), tmp_path)
     assert result.verdict.energy == "not usable"
     assert result.verdict.confirmed_by["energy"] == ("nothing",)
     assert found[CODE].names["witness"] == "slope"

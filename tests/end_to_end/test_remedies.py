@@ -16,7 +16,7 @@ MIN_COVERAGE = 0.8
 
 
 FAULTS = (
-    "imu_late", "visual_late", "gyroscope_mirrored", "wheels_too_fast", "axes_swapped", "fixes_jump", "currents_in_milliamperes",
+    "imu_late", "gyroscope_mirrored", "wheels_too_fast", "axes_swapped", "fixes_jump", "currents_in_milliamperes",
     "power_slow",
 )  # fmt: skip
 """Faults whose printed lines test_bad_sensors.py and test_power_sensor.py do not follow."""

@@ -1,16 +1,12 @@
-"""verify, explain and diff as a user runs them, from a simulated log on; and a build that is killed half-way."""
+"""verify, explain, overlay, preflight, audit and diff as a user runs them, from a simulated log on."""
 
 import json
-import os
 import re
-import signal
-import subprocess
-import time
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from installed_command import COMMAND, plain_lines, tcpipe
+from installed_command import plain_lines, tcpipe
 from mcap.reader import make_reader
 from pyproj import Geod
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -200,26 +196,3 @@ def test_diff_names_cause_and_effect(work):
     found = json.loads(tcpipe("diff", "dataset", "other", "--json", cwd=work).stdout)
     assert (found["same"], found["causes"]) == (False, ["recipe: split.holdout block → sample"])
     assert found["samples"]["other patches"] == 0
-
-
-def test_what_cannot_be_asked_is_said_in_a_line(work):
-    plain_lines(tcpipe("verify", "nowhere", cwd=work), 2)
-    plain_lines(tcpipe("explain", "no-such-sample", cwd=work), 1)
-    plain_lines(tcpipe("diff", "dataset", "tcpipe-store", cwd=work), 2)
-
-
-def test_a_build_that_is_killed_leaves_what_the_next_one_clears_away(work):
-    before = sorted(path.name for path in work.iterdir())
-    with subprocess.Popen(
-        [COMMAND, "build-dataset", "killed", "--quiet"], cwd=work, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    ) as building:
-        while building.poll() is None and not any(work.glob(".tmp-killed-*/killed")):
-            time.sleep(0.01)
-        os.kill(building.pid, signal.SIGKILL)
-    assert building.returncode == -signal.SIGKILL, "it was done before it could be killed"
-    assert not (work / "killed").exists()
-    assert any(work.glob(".tmp-killed-*"))
-    done = tcpipe("build-dataset", "killed", "--quiet", cwd=work)
-    assert done.returncode == 3, done.stderr
-    assert sorted(path.name for path in work.iterdir()) == sorted([*before, "killed"])
-    assert tcpipe("verify", "killed", cwd=work).returncode == 0
