@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -349,9 +350,13 @@ def hostile(options: argparse.Namespace) -> bool:
 def mutated(options: argparse.Namespace) -> bool:
     """Read mutated logs: each loss and each change must be reported."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fuzz"))
-    from mutated_logs import mutations
+    from mutated_logs import findings
 
-    verdicts = mutations(options.mutations, options.seed)
+    verdicts = Counter[str]()
+    for finding in findings(options.mutations, options.seed):
+        verdicts[finding.verdict] += 1
+        if finding.verdict == "silent":
+            print(f"{finding.kind}: {finding.what}")
     print(*(f"{verdict:32} {count:6}" for verdict, count in verdicts.items()), sep="\n")
     print("\nfalse if: a mutated log is read otherwise than the whole one, and nothing of it is told (silent)")
     return not verdicts["silent"]

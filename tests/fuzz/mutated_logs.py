@@ -1,8 +1,8 @@
 """Small logs of every container with a changed structure, and an oracle: each loss and change is reported.
 
-By hand: ``python tests/fuzz/mutated_logs.py [--count 10000] [--seed 1] [--keep DIR]``. Each mutation changes one to three places of a
-log (lengths, op codes, ids, stamps, CRCs, indexes; SQLite's page heads, cell pointers, varints, serial types, chains; or any bytes), or
-cuts, inserts, deletes or swaps. The log is then read twice, all topics at once and one in pieces, and judged:
+By hand: ``python benchmarks/faults.py mutations``. Each mutation changes one to three places of a log (lengths, op codes, ids, stamps,
+CRCs, indexes; SQLite's page heads, cell pointers, varints, serial types, chains; or any bytes), or cuts, inserts, deletes or swaps. The
+log is then read twice, all topics at once and one in pieces, and judged:
 
 - ``refused``: one plain line, nothing is read.
 - ``same``: every message is read as it was written, and nothing else.
@@ -17,7 +17,6 @@ cuts, inserts, deletes or swaps. The log is then read twice, all topics at once 
 What nobody can know is not tried: a whole message, row or chunk taken cleanly out of a log that nowhere counts them.
 """
 
-import argparse
 import json
 import sqlite3
 import struct
@@ -39,7 +38,6 @@ from rosbags.rosbag1 import Writer as BagWriter
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import open_log
 
-VERDICTS = ("refused", "same", "told", "value", "silent")
 _PIECE = 4
 _PIECE_BYTES = 1 << 10
 """Size of the tables that one topic alone is read in [bytes]."""
@@ -71,7 +69,6 @@ class Finding:
     kind: str
     verdict: str
     what: str
-    data: bytes
 
 
 # ---------------------------------------------------------------- intact logs
@@ -446,35 +443,4 @@ def findings(count: int, seed: int) -> Iterator[Finding]:
             again, why_again = judged(clean, data, touched, alone)
             if again == "silent":
                 verdict, why = again, f"{alone} alone: {why_again}"
-        yield Finding(clean.kind, verdict, f"number {number}: {what}: {why}", data)
-
-
-def mutations(count: int, seed: int) -> dict[str, int]:
-    """Return how many of ``count`` mutated logs got each verdict."""
-    verdicts = Counter(finding.verdict for finding in findings(count, seed))
-    return {verdict: verdicts[verdict] for verdict in VERDICTS}
-
-
-def main() -> int:
-    """Mutate, judge, print what was silent and the counts; 1 where something was."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--count", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--keep", type=Path, help="a directory for the logs that were read silently wrong")
-    given = parser.parse_args()
-    counts: Counter[tuple[str, str]] = Counter()
-    for number, finding in enumerate(findings(given.count, given.seed)):
-        counts[finding.kind.split(",")[0], finding.verdict] += 1
-        if finding.verdict == "silent":
-            sys.stdout.write(f"{finding.kind}: {finding.what}\n")
-            if given.keep:
-                given.keep.mkdir(parents=True, exist_ok=True)
-                (given.keep / f"{number}.log").write_bytes(finding.data)
-    for container in ("mcap", "bag", "db3"):
-        each = ", ".join(f"{verdict} {counts[container, verdict]}" for verdict in VERDICTS)
-        sys.stdout.write(f"{container}: {each}\n")
-    return int(any(verdict == "silent" for _, verdict in counts))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        yield Finding(clean.kind, verdict, f"number {number}: {what}: {why}")

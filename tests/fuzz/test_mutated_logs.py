@@ -1,4 +1,4 @@
-"""A few mutations of each container, always the same; the campaign of ten thousand is ``python tests/fuzz/mutated_logs.py``."""
+"""A few mutations of each container, always the same; the campaign of ten thousand is ``python benchmarks/faults.py mutations``."""
 
 import importlib.util
 import sys
