@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,15 +10,12 @@ import pyarrow.parquet as pq
 import pytest
 from autopilot_files import AMP, ANTENNA_FRD, SPEED_MPS, VOLT, DataFlash, Drive, Ulog, write_dataflash, write_ulog
 from installed_command import tcpipe as run_tcpipe
-from object_gateway import in_environment
 from shared_data import shared_data
-from storage_server import object_store
 
 import tcpipe
 from tcpipe.formats.logs.autopilot_log import read_autopilot_records
 from tcpipe.logs.topics import split_notes
-from tcpipe.pipeline.inspect import inspect
-from tcpipe.recipe import ReadConfig, Recipe
+from tcpipe.recipe import ReadConfig
 from tcpipe.robots import Profiles
 from tcpipe.stages.read import read_run
 
@@ -312,16 +308,3 @@ def test_a_bin_that_is_no_log_is_passed_over_in_a_folder(tmp_path):
     assert Path(told["path"]).name == "1.BIN"
     refused = run_tcpipe("inspect", "000000.bin", cwd=tmp_path)
     assert (refused.returncode != 0, "not a log" in refused.stderr) == (True, True)
-
-
-def test_logs_of_autopilots_lie_in_object_storage(logs, tmp_path, monkeypatch):
-    folder = tmp_path / "store" / "drives"
-    folder.mkdir(parents=True)
-    with object_store(tmp_path / "store") as (settings, _):
-        in_environment(monkeypatch, settings, tmp_path / "cache")
-        for kind, suffix in (("ulog", "ulg"), ("dataflash", "BIN")):
-            shutil.copyfile(logs[kind], folder / f"run.{suffix}")
-            with tcpipe.read_log(f"s3://drives/run.{suffix}") as there, tcpipe.read_log(logs[kind]) as here:
-                assert there.topics == here.topics
-                assert (there.sha256(), there.size_bytes) == (here.sha256(), here.size_bytes)
-        assert inspect("s3://drives", recipe=Recipe()).path == "s3://drives/run.ulg"  # a .bin of a bucket must be named

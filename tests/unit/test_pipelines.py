@@ -6,9 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import polars as pl
 import pytest
 
@@ -16,13 +14,10 @@ import tcpipe
 from tcpipe.cli import cli
 from tcpipe.formats.logs.log_joining import AnyLog, open_logs
 from tcpipe.formats.logs.table_log import open_tables
-from tcpipe.formats.logs.writing import MessageStream, write_bag
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, load_recipe
 from tcpipe.logs.topics import Topic
-from tcpipe.pipeline.ingest import ingest
 from tcpipe.recipe import Recipe
 from tcpipe.stages.read import decide_roles, find_read_config
-from tcpipe.store import Store
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 VI, SIDES = ("voltage", "current"), ("left", "right")
@@ -159,78 +154,26 @@ def test_fau_and_borealtc_map_the_columns_that_are_published(tmp_path: Path) -> 
     assert wheels["twist.twist.angular.z"][0].as_py() == pytest.approx(0.5 / 0.85)
 
 
-def write_enav_bag(path: Path) -> Path:
-    """Write a bag with the topics, types and IMU axes of ENAV: 10 s of standing, then 60 s eastward at 0.45 m/s with 248 W."""
-    noise, start_ns = np.random.default_rng(0), 1_536_000_000_000_000_000
-
-    def stream(topic: str, kind: str, rate_hz: int, columns: Any, **constants: Any) -> MessageStream:
-        """Return a topic; ``columns`` gives its fields by the time since motion began [s]: forward speed rises for one second."""
-        log_ns = start_ns + np.arange(70 * rate_hz) * (10**9 // rate_hz)
-        stamp = {"header.stamp.sec": log_ns // 10**9, "header.stamp.nanosec": log_ns % 10**9}
-        stamped = {} if kind.endswith("Twist") else stamp
-        return MessageStream(topic, kind, log_ns, stamped | columns((log_ns - start_ns) * 1e-9 - 10.0), constants)
-
-    def scatter(time_s: Any, std: float) -> Any:
-        return std * noise.standard_normal(time_s.size)
-
-    def place(time_s: Any) -> dict[str, Any]:
-        rise_s = np.clip(time_s, 0.0, 1.0)
-        east_m = 0.45 * (np.maximum(time_s, 0.0) - rise_s + rise_s**2 / 2) + scatter(time_s, 0.02)
-        latitude = 45.5178 + scatter(time_s, 0.02) / 111_140.0
-        return {
-            "longitude": -73.3931 + east_m / 78_100.0,
-            "latitude": latitude,
-            "altitude": 25.0 + scatter(time_s, 0.03),
-        }
-
-    def move(time_s: Any) -> dict[str, Any]:
-        force = {"x": 0.0, "y": -0.45 * ((time_s >= 0.0) & (time_s < 1.0)), "z": -9.81}  # y backward, z down
-        turns = {f"angular_velocity.{axis}": scatter(time_s, 0.002) for axis in "xyz"}
-        return turns | {f"linear_acceleration.{axis}": force[axis] + scatter(time_s, 0.05) for axis in "xyz"}
-
-    def draw(time_s: Any) -> dict[str, Any]:
-        amps = np.where(time_s >= 0.0, 5.0, 0.3) + scatter(time_s, 0.1)
-        return {
-            f"{side}_driver_{what}": value
-            for side in SIDES
-            for what, value in zip(VI, (25.0 - 0.05 * amps, amps), strict=True)
-        }
-
-    def roll(time_s: Any) -> dict[str, Any]:
-        return {"twist.twist.linear.x": 0.45 * np.clip(time_s, 0.0, 1.0) + scatter(time_s, 0.01)}
-
-    sun = [f"/{reference}_sun_orientation" for reference in ("relative", "global")]
-    streams = [
-        stream("/gps", "sensor_msgs/msg/NavSatFix", 5, place, **{"header.frame_id": "gps"}),
-        stream("/imu", "sensor_msgs/msg/Imu", 50, move, **{"header.frame_id": "imu", "orientation.x": 1.0}),
-        stream("/husky_velocity_estimate", "nav_msgs/msg/Odometry", 10, roll, child_frame_id="base_link"),
-        stream("/husky_commanded_velocity", "geometry_msgs/msg/Twist", 10, lambda t: {"linear.x": 1.5 * (t >= 0.0)}),
-        stream("/status", "husky_msgs/msg/HuskyStatus", 10, draw, battery_voltage=26.0),
-        stream("/joint_states", "sensor_msgs/msg/JointState", 10, lambda _: {}, position=[0.0] * 4),
-        stream("/global_odometry_utm", "nav_msgs/msg/Odometry", 10, lambda t: {"pose.pose.position.x": t}),
-        *(stream(topic, "geometry_msgs/msg/PoseStamped", 1, lambda t: {"pose.position.x": t}) for topic in sun),
-    ]
-    write_bag(path, streams)
-    return path
-
-
-def test_enav_reads_a_bag_with_the_topics_of_its_loader(tmp_path: Path) -> None:
+def test_enav_plays_its_roles_by_the_topics_of_its_loader() -> None:
     recipe = load_recipe(PIPELINES / "enav.toml")
-    log_path = write_enav_bag(tmp_path / "run2_base_new.bag")
-    with open_logs([log_path]) as log:
-        assert played(recipe, log) == {"gnss", "imu", "wheel_odometry", "command", "power"}
-    (result,) = ingest([log_path], store=tmp_path / "store", recipe=recipe).results
-    assert result.status == "done"
-    (run,) = Store(tmp_path / "store").runs()
-    assert {role: sensor.topic for role, sensor in run.facts.sensors.items()} == {
-        "gnss": "/gps",
-        "imu": "/imu",
-        "wheel_odometry": "/husky_velocity_estimate",
-        "command": "/husky_commanded_velocity",
-        "power": "/status",
+    kinds = {
+        "/gps": "sensor_msgs/msg/NavSatFix",
+        "/imu": "sensor_msgs/msg/Imu",
+        "/husky_velocity_estimate": "nav_msgs/msg/Odometry",
+        "/husky_commanded_velocity": "geometry_msgs/msg/Twist",
+        "/status": "husky_msgs/msg/HuskyStatus",
+        "/joint_states": "sensor_msgs/msg/JointState",
+        "/global_odometry_utm": "nav_msgs/msg/Odometry",
+        "/relative_sun_orientation": "geometry_msgs/msg/PoseStamped",
+        "/global_sun_orientation": "geometry_msgs/msg/PoseStamped",
     }
-    assert not [finding for finding in run.facts.findings if finding.severity != "note"]
-    segments = run.segments()
-    assert segments.num_rows >= 24
-    assert np.mean(segments["energy_joule"]) == pytest.approx(2 * 5.0 * 24.75 / 0.45, rel=0.01)
-    assert abs(np.mean(segments["pitch_rad"])) < 0.03
+    topics = [Topic(name, kind, 600, 0, 60_000_000_000, "ros1", "") for name, kind in kinds.items()]
+    found = decide_roles(recipe.read, topics, recipe.robot, known=load_profiles(recipe))
+    assert found.problems == ()
+    assert {role: of.topics for role, of in found.roles.items()} == {
+        "gnss": ("/gps",),
+        "imu": ("/imu",),
+        "wheel_odometry": ("/husky_velocity_estimate",),
+        "command": ("/husky_commanded_velocity",),
+        "power": ("/status",),
+    }

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -91,19 +90,6 @@ def test_a_run_that_is_written_again_replaces_the_one_before_and_recipes_live_si
         assert [found.name for found in store.find_runs(run.name)] == [run.name]
         assert run.manifest.recipe_id == run.recipe_id
     assert store.find_runs(f"{RUN}/nosuch") == store.find_runs("nosuch") == []
-
-
-def test_two_that_write_one_run_at_once_write_to_folders_of_their_own_and_all_readers_find_the_same_one(root):
-    store = open_store(root, create=True)
-    before = store.scan()
-    for length_m in (10.0, 12.0):
-        put(store, length_m, state=before)
-        before.highest.clear()  # as the second has not seen what the first has written
-    found = store.scan()
-    assert len(found.blobs) == 2
-    assert len(found.beaten) == 1
-    assert counted(store) in ([10], [12])
-    assert counted(store) == counted(Store(root))
 
 
 def test_tags_are_added_to_those_of_a_log_and_outlive_its_runs(root):
@@ -200,13 +186,6 @@ def test_a_store_is_moved_by_copying_its_files_and_two_are_put_together_in_the_s
     assert counted(open_store(tmp_path / "moved")) == [10, 10]
 
 
-def test_what_a_killed_call_left_on_this_machine_goes_when_a_store_is_opened(tmp_path, monkeypatch, served):
-    (tmp_path / f"tcpipe-{os.getuid()}-0123abcd" / "new").mkdir(parents=True)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    open_store("s3://tests/store", create=True)
-    assert not list(tmp_path.glob("tcpipe-*"))
-
-
 # --- where there is no store ----------------------------------------------------------------------------------------
 
 
@@ -255,22 +234,6 @@ def test_a_bucket_that_cannot_be_written_says_so_where_something_is_written(tmp_
 
 
 # --- files in a bucket, maps and names ------------------------------------------------------------------------------
-
-
-def test_a_table_in_a_bucket_is_fetched_once_and_proved(tmp_path, served):
-    store = open_store("s3://tests/store", create=True)
-    put(store)
-    for _ in range(2):
-        assert counted(store) == [10]
-    assert sum(name.endswith("segments.parquet") for name in served) == 1
-    for copy in filter(Path.is_file, (tmp_path / "cache").rglob("*")):
-        copy.write_bytes(b"x" * copy.stat().st_size)
-    assert counted(store) == [10], "what is damaged here is fetched anew"
-    (path,) = (tmp_path / "served").rglob("segments.parquet")
-    path.write_bytes(b"x" * path.stat().st_size)
-    shutil.rmtree(tmp_path / "cache")
-    with pytest.raises(StoreError, match=r"s3://tests/store/blobs/.*/segments.parquet: its sha256 is"):
-        store.runs()[0].segments()
 
 
 def add_map(store, text, *, before=lambda: None):

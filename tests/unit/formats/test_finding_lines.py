@@ -97,10 +97,3 @@ def test_a_verdict_is_one_line_and_judged_again_by_another_catalogue():
     old = Verdict(catalogue="another")
     assert judge_again(old, [EMPTY]) == judge([EMPTY])
     assert judge_again(Verdict(), [EMPTY]) == Verdict()
-
-
-def test_a_short_span_is_written_with_tenths_of_a_second():
-    role, numbers = Subject("role", "gnss"), {"off_m": 0.4, "event_count": 1}
-    for span_s, text in (((300.2, 310.4), "300 to 310 s"), ((15.02, 15.31), "15.0 to 15.3 s")):
-        finding = make_finding("gnss-contradicts-odometry", role, span_s=span_s, **numbers)
-        assert format_findings([finding])[0].partition("worst at ")[2].startswith(f"{text}. ")

@@ -212,15 +212,6 @@ def test_what_is_written_counts_also_where_the_answer_is_lost(served: Fetched) -
 
 
 @pytest.mark.usefixtures("served")
-def test_a_copy_that_is_not_what_it_should_be_is_no_copy() -> None:
-    place = open_place("s3://tests")
-    place.put("a", b"damaged")
-    for _ in range(2):
-        with pytest.raises(StoreError, match="s3://tests/a: its sha256 is"):
-            place.fetch("a", Checksum(7, hashlib.sha256(b"content").hexdigest()))
-
-
-@pytest.mark.usefixtures("served")
 def test_the_cache_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("TCPIPE_CACHE_BYTES", "2500")
     monkeypatch.setattr("tcpipe.formats.cache._IN_USE_S", -1.0)

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import pyarrow as pa
 import pytest
 from mcap.writer import CompressionType, IndexType
 from random_messages import (
@@ -233,17 +232,6 @@ def test_directories_that_are_no_bag_are_refused(tmp_path):
         open_log(tmp_path / "nowhere.mcap")
 
 
-def test_of_a_folder_of_logs_one_is_to_be_given(tmp_path):
-    for day in range(9):
-        (tmp_path / f"{day}").mkdir()
-        (tmp_path / f"{day}" / "a.bag").touch()
-    with pytest.raises(LogError) as refused:
-        open_log(tmp_path)
-    assert refused.value.problems[1].endswith(
-        "/0/a.bag, " + ", ".join(f"{tmp_path}/{n}/a.bag" for n in "1234") + " and more"
-    )
-
-
 def test_a_topic_that_is_not_there_is_named_with_those_that_are(tmp_path):
     path = write_mcap(tmp_path / "run.mcap", random_messages(19, count=3, types=TYPES[:1]))
     with open_log(path) as log, pytest.raises(LogError, match="there is no topic /nope; it has /Imu"):
@@ -292,18 +280,3 @@ def test_an_open_db3_with_a_journal_is_read_whole(tmp_path):
     with open_log(path) as log:
         assert log.table("/Imu").num_rows == len(messages) + 1
     writer.close()
-
-
-def test_schema_has_lists_structs_and_fixed_lists(tmp_path):
-    messages = random_messages(22, count=3, types=("sensor_msgs/msg/Imu", "nav_msgs/msg/Path"))
-    with open_log(write_mcap(tmp_path / "run.mcap", messages)) as log:
-        tables = log.tables(log.topics)
-    assert tables["/Imu"].schema.field("orientation_covariance").type == pa.list_(pa.float64(), 9)
-    assert pa.types.is_struct(tables["/Path"].schema.field("poses").type.value_type)
-    assert tables["/Imu"].column_names[:5] == [
-        "log_time_ns",
-        "publish_time_ns",
-        "header.stamp.sec",
-        "header.stamp.nanosec",
-        "header.frame_id",
-    ]

@@ -38,22 +38,6 @@ def test_every_column_arrives_in_its_field_in_log_order(tmp_path, compression):
     assert {row.header.frame_id for _, row in rows} == {"base_link"}
 
 
-def test_streams_are_merged_by_log_time(tmp_path):
-    other = MessageStream("/flag", "std_msgs/msg/Bool", np.array([2_000_000_000]), {"data": np.array([True])})
-    write_bag(tmp_path / "a.bag", [battery(), other])
-    with BagReader(tmp_path / "a.bag") as reader:
-        assert [c.topic for c, _, _ in reader.messages()] == ["/battery", "/flag", "/battery", "/battery"]
-
-
-def test_an_empty_stream_is_a_topic_without_messages(tmp_path):
-    empty = MessageStream(
-        "/flag", "std_msgs/msg/Bool", np.array([], dtype=np.int64), {"data": np.array([], dtype=bool)}
-    )
-    write_bag(tmp_path / "a.bag", [battery(), empty])
-    with BagReader(tmp_path / "a.bag") as reader:
-        assert reader.topics["/flag"].msgcount == 0
-
-
 @pytest.mark.parametrize(
     "values", [np.array([b"a", b"bc"]), np.array(["a", "b"]), np.array([[1], [2, 3]], dtype=object)]
 )

@@ -114,17 +114,6 @@ def test_a_raster_in_another_crs_lands_on_the_same_ground(tmp_path, crs):
     assert bool(rough) == (crs in {"EPSG:31256", "EPSG:2263"})
 
 
-@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857"])
-def test_a_raster_that_is_not_metric_goes_to_its_utm_zone(tmp_path, crs):
-    to_crs = pyproj.Transformer.from_crs(WORLD.crs, crs, always_xy=True)
-    x, y = to_crs.transform(WORLD.x_m + np.array([-20.0, 20.0]), WORLD.y_m + np.array([-20.0, 20.0]))
-    affine = Affine((x[1] - x[0]) / 100, 0.0, x[0], 0.0, -(y[1] - y[0]) / 100, y[1])
-    write_tif(tmp_path / "h.tif", np.full((1, 100, 100), 100.0, np.float32), crs, affine)
-    _, source = built(tmp_path, height=tmp_path / "h.tif")
-    assert source.grid.crs == "EPSG:32633"
-    assert source.grid.pixel_size_m == pytest.approx(0.4, rel=0.02)
-
-
 @pytest.mark.parametrize("west_deg", [179.9999, -180.0001])
 def test_a_raster_across_the_antimeridian_is_whole(tmp_path, west_deg):
     """In degrees, 21 m wide; heights rise by 1 m a pixel of 1e-6 degrees from one side to the other."""
@@ -154,35 +143,6 @@ def test_a_raster_may_be_of_these_kinds_whatever_its_name(tmp_path, driver):
     rasterio.shutil.copy(path, tmp_path / "copy.x", driver=driver)
     _, source = built(tmp_path, height=tmp_path / "copy.x")
     assert check_plane(source).all()
-
-
-@pytest.mark.parametrize(("options", "value"), [({"nbits": 1}, 1), ({"photometric": "YCBCR", "compress": "jpeg"}, 120)])
-def test_orthophotos_of_odd_kinds_become_grey(tmp_path, options, value, height):
-    bands = 3 if "photometric" in options else 1
-    write_tif(tmp_path / "o.tif", np.full((bands, 400, 400), value, np.uint8), WORLD.crs, NORTH_UP, **options)
-    _, source = built(tmp_path, height=height, ortho=tmp_path / "o.tif")
-    assert np.unique(source.read("ortho", 0, 400, 0, 400)).tolist() == [255 if bands == 1 else value]
-
-
-def test_layers_on_other_grids_are_put_on_the_finest(tmp_path):
-    coarse = Affine(0.5, 0.0, LEFT - 3.0, 0.0, -0.5, TOP + 3.0)
-    write_tif(tmp_path / "h.tif", raster_of(plane, coarse, 92, 92), WORLD.crs, coarse)
-    grey = raster_of(WORLD.grey, NORTH_UP)[0]
-    write_tif(tmp_path / "o.tif", np.stack([grey.astype(np.uint8)] * 3), WORLD.crs, NORTH_UP)
-    other = Affine(0.25, 0.0, LEFT, 0.0, -0.25, TOP)
-    write_tif(tmp_path / "t.tif", raster_of(WORLD.terrain, other, 160, 160, np.int32), WORLD.crs, other)
-    summary, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / "o.tif", terrain=tmp_path / "t.tif")
-    assert source.grid.pixel_size_m == 0.1
-    assert source.grid.bounds_m == pytest.approx((LEFT - 3.0, TOP - 43.0, LEFT + 43.0, TOP + 3.0))
-    present = check_plane(source)
-    assert not present[:2].any()  # within half a source pixel of the edge nothing is known
-    inside = source.read("ortho", 30, 430, 30, 430)
-    np.testing.assert_allclose(inside, np.floor(grey), atol=1.0)
-    terrain = source.read("terrain", 30, 430, 30, 430)
-    assert (
-        terrain == raster_of(WORLD.terrain, other, 160, 160, np.uint8)[0].repeat(5, 0).repeat(5, 1)[::2, ::2]
-    ).mean() > 0.98
-    assert summary.covered["ortho"] == pytest.approx(400**2 / 460**2)
 
 
 def test_a_finer_layer_is_averaged_and_classes_take_the_majority(tmp_path):
@@ -348,15 +308,6 @@ def test_palette_indices_are_class_values_and_what_is_transparent_is_nodata(tmp_
     )  # keeps opacity, which a GeoTIFF does not
     _, source = built(tmp_path, height=height, terrain=tmp_path / "p.img")
     assert source.read("terrain", 9, 10, 0, 400)[0, 50::100].tolist() == [4, 5, 0, 7]
-
-
-def test_shards_meet_without_a_seam(tmp_path):
-    affine = Affine(0.1, 0.0, LEFT, 0.0, -0.1, TOP)
-    write_tif(tmp_path / "h.tif", raster_of(plane, affine, 60, 2300), "EPSG:32634", affine)
-    _, source = built(tmp_path, height=tmp_path / "h.tif", crs="EPSG:32634", pixel_size_m=0.07)
-    found = heights(source)
-    steps = np.diff(found[10:-10], axis=1)
-    assert np.nanmax(np.abs(steps - 0.2 * 0.07)) < 1e-4
 
 
 def bad_rasters(directory: Path):
