@@ -31,6 +31,13 @@ from pathlib import Path
 import numba.core.config
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def name_files(form: str, names: str) -> tuple[str, ...]:
+    """Return the files of names."""
+    return tuple(form.format(name) for name in names.split())
+
+
 ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "motion": (("tcpipe/motion",), ("tests/unit/motion",)),
     "path": (("tcpipe/path.py",), ("tests/unit/test_path.py",)),
@@ -39,84 +46,41 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "cost": (("tcpipe/cost",), ("tests/unit/cost", "tests/unit/stages/test_label.py")),
     "terrain": (("tcpipe/terrain",), ("tests/unit/terrain", "tests/unit/stages/test_sample.py")),
     "findings": (
-        (
-            "tcpipe/tables/facts.py",
-            "tcpipe/stages/read.py",
-            "tcpipe/stages/fuse_findings.py",
-            "tcpipe/stages/label_motion.py",
-        ),
-        (
-            "tests/unit/stages/test_read_findings.py",
-            "tests/unit/stages/test_fuse_findings.py",
-            "tests/unit/stages/test_label_quality.py",
-        ),
+        name_files("tcpipe/{}.py", "tables/facts stages/read stages/fuse_findings stages/label_motion"),
+        name_files("tests/unit/stages/test_{}.py", "read_findings fuse_findings label_quality"),
     ),
     "geometry": (("tcpipe/geometry",), ("tests/unit/geometry", "tests/property/geometry")),
     "logs": (
-        tuple(
-            f"tcpipe/logs/{name}.py"
-            for name in (
-                "clocks",
-                "expressions",
-                "extrinsics",
-                "field_mapping",
-                "fix_quality",
-                "messages",
-                "power_fields",
-                "roles",
-                "wire_types",
-            )
+        name_files(
+            "tcpipe/logs/{}.py",
+            "clocks expressions extrinsics field_mapping fix_quality messages power_fields roles wire_types",
         ),
-        ("tests/unit/logs",),
+        ("tests/unit/logs", "tests/property/test_wire_decoding.py"),
     ),
     "fusion": (
         (
-            *(
-                f"tcpipe/fusion/{name}.py"
-                for name in (
-                    "attitude",
-                    "dead_reckoning",
-                    "densities",
-                    "initial",
-                    "level_motion",
-                    "measurements",
-                    "pair_residuals",
-                    "preparation",
-                    "process",
-                    "signals",
-                    "ticks",
-                )
+            *name_files(
+                "tcpipe/fusion/{}.py",
+                "attitude dead_reckoning densities initial level_motion measurements pair_residuals preparation process signals ticks",
             ),
             "tcpipe/fusion/checks",
         ),
         (
-            *(
-                f"tests/unit/fusion/test_{name}.py"
-                for name in (
-                    "signals",
-                    "attitude",
-                    "dead_reckoning",
-                    "noise_curves",
-                    "preparation",
-                    "pose_increments",
-                    "initial",
-                    "ticks",
-                )
+            *name_files(
+                "tests/unit/fusion/test_{}.py",
+                "signals attitude dead_reckoning preparation pose_increments initial ticks",
             ),
             "tests/unit/fusion/checks",
             "tests/unit/fusion/test_densities.py",
         ),
     ),
     "kernels": (
-        tuple(f"tcpipe/fusion/{name}.py" for name in ("state", "filter_kernel", "smoother_kernel")),
+        name_files("tcpipe/fusion/{}.py", "state filter_kernel smoother_kernel"),
         ("tests/unit/fusion/test_filter_kernel.py",),
     ),
     "estimator": (
-        tuple(f"tcpipe/fusion/{name}.py" for name in ("error_state", "hypotheses", "parameters", "ukf15")),
-        tuple(
-            f"tests/unit/fusion/test_{name}.py"
-            for name in ("parameters", "process", "error_state", "hypotheses", "ukf15")
-        ),
+        name_files("tcpipe/fusion/{}.py", "error_state parameters ukf15"),
+        name_files("tests/unit/fusion/test_{}.py", "parameters process error_state ukf15"),
     ),
     "verify": (("tcpipe/pipeline/verify.py",), ("tests/unit/pipeline/test_trust.py",)),
 }

@@ -1,4 +1,4 @@
-"""Four invented loggers that write tables of one drive, each with names, units and clocks of its own, and the truth to judge labels by."""
+"""Three invented loggers that write tables of one drive, each with names, units and clocks of its own, and the truth to judge labels by."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -125,50 +125,6 @@ def write_german(drive: Drive, folder: Path) -> None:
     write_text(folder / "Messfahrt.csv", columns, separator=";", comma=True, encoding="cp1252")
 
 
-VESC_ZEROS = (
-    "temp_mos_max temp_mos_1 temp_mos_2 temp_mos_3 temp_motor d_axis_current q_axis_current duty_cycle amp_hours_used amp_hours_charged "
-    "watt_hours_used watt_hours_charged encoder_position fault_code vesc_id d_axis_voltage q_axis_voltage"
-)
-
-
-def write_vesc_tool(drive: Drive, folder: Path) -> None:
-    """Write a table as VESC Tool logs it: milliseconds of the local day, the date in the file's name, g and deg/s without saying so."""
-    rows = drive.sample(20)
-    midnight_s = START.hour * 3600 + START.minute * 60 + START.second + START.microsecond * 1e-6
-    zeros = np.zeros(rows["t"].size)
-    of_day = np.round(1000 * (rows["t"] + midnight_s)).astype(np.int64)
-    columns = {
-        "ms_today": of_day,
-        "input_voltage": rows["volt"],
-        **dict.fromkeys(VESC_ZEROS.split(), zeros),
-        "current_motor": 2.5 * rows["amp"],
-        "current_in": rows["amp"],
-        "erpm": 3000 * rows["left"],
-        "ms_today_setup": of_day,
-        "current_in_setup": rows["amp"],
-        "current_motor_setup": 2.5 * rows["amp"],
-        "speed_meters_per_sec": rows["left"],
-        "tacho_meters": zeros,
-        "num_vescs": zeros + 1,
-        "ms_today_imu": of_day,
-        "roll": zeros,
-        "pitch": zeros,
-        "yaw": zeros,
-        **{f"acc{axis.upper()}": rows[f"acc_{axis}"] / GRAVITY for axis in "xyz"},
-        **{f"gyro{axis.upper()}": np.degrees(rows[f"gyro_{axis}"]) for axis in "xyz"},
-        "gnss_posTime": np.round(1000 * (rows["fix_t"] + midnight_s - 7200)).astype(np.int64),
-        "gnss_lat": rows["latitude"],
-        "gnss_lon": rows["longitude"],
-        "gnss_alt": rows["altitude"],
-        "gnss_gVel": rows["left"],
-        "gnss_vVel": zeros,
-        "gnss_hAcc": zeros + 0.015,
-        "gnss_vAcc": zeros + 0.03,
-        "": [""] * zeros.size,
-    }
-    write_text(folder / "2025-07-09_14-03-12.csv", columns, separator=";")
-
-
 def write_french(drive: Drive, folder: Path) -> None:
     """Write four tables of one drive with suffixes of their own, and local times as ISO texts without a zone."""
     fast, slow = drive.sample(50), drive.sample(20)
@@ -218,7 +174,6 @@ class Logger:
 
 LOGGERS = {
     "german": Logger(write_german, "Messfahrt.csv", {"stamp_zone": '"Europe/Vienna"'}),
-    "vesc_tool": Logger(write_vesc_tool, "2025-07-09_14-03-12.csv", {"stamp_zone": '"Europe/Vienna"'}),
     "french": Logger(write_french, ".", {"stamp_zone": '"Europe/Vienna"'}),
     "spanish": Logger(write_spanish, ".", {}),
 }

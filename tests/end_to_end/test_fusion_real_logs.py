@@ -64,12 +64,3 @@ def test_husky_with_an_imu_mounted_on_its_side_and_sbas():
     moving = to_floats(table, "wheel_velocity_mps") > 0.5
     assert np.median(to_floats(table, "forward_velocity_mps")[moving]) == pytest.approx(0.98, abs=0.1)
     assert track.info.report.facts.fuse.stretches[0].heading_from == "course over ground"
-
-
-def test_a_metre_of_the_wheels_stays_one_where_nothing_else_tells_it():
-    streams, track = fused("robot_localization/test2.bag")
-    wheels = streams.tables["wheel_odometry"]
-    own_m = np.sum(np.abs(to_floats(wheels, "velocity_x_mps")[1:]) * np.diff(to_integers(wheels, "stamp_ns")) * 1e-9)
-    assert path_m(track.table) == pytest.approx(own_m, rel=0.02)  # an accelerometer had made half of it
-    assert np.isnan(to_floats(wheels, "velocity_y_mps")).all()
-    assert "odometry-scale-unobservable" in {of.code for of in track.info.report.findings}

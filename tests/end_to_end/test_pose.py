@@ -108,16 +108,6 @@ def test_a_pose_that_nothing_places_shows_its_arm_and_turn_and_is_not_weak(run):
     assert stated["rpy_rad"] == pytest.approx([0.0, 0.0, TURN_RAD], abs=0.06)
 
 
-def test_everything_is_said_of_the_pose_and_nothing_of_gnss(run):
-    track, labelled = run()
-    facts = labelled.info.report.facts.fuse
-    assert "pose" in facts.sensors
-    assert not {"gnss"} & {*facts.sensors, *facts.measurements, *facts.rejected, *facts.set_aside}
-    assert "gnss" not in {finding.subject.name for finding in labelled.info.report.findings}
-    assert "gnss" not in set(track.rejections["role"].to_pylist())
-    assert "mounting of the pose" in facts.stretches[0].parameters
-
-
 def test_a_wrong_mounting_is_found_and_following_the_finding_ends_it(run):
     (finding,) = select_findings(run("visual", placed=0.0)[1].info.report.findings, "pose-rotated")
     assert finding.numbers["off_rad"] == pytest.approx(TURN_RAD, abs=0.15)

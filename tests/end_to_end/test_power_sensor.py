@@ -137,14 +137,6 @@ def test_motion_with_the_power_of_rest_is_named_with_its_span_and_a_line_that_dr
     assert not find_codes(label(drive, lambda amp, _: np.maximum(amp, amp[:40].mean())))
 
 
-def test_a_change_of_gain_has_its_time_and_ratio(drive):
-    change, code = FAULTS["gain + 10 %"]
-    found = find_codes(label(drive, change))[code]
-    stamp_ns = to_integers(drive[0].tables["power"], "stamp_ns")
-    assert found.numbers["gain_ratio"] == pytest.approx(1.1, abs=0.03)
-    assert found.span_s[0] == pytest.approx(0.5 * (stamp_ns[-1] - stamp_ns[0]) * 1e-9, abs=20.0)
-
-
 def test_a_right_sensor_gives_no_finding_and_only_its_prior(drive):
     labelled = label(drive)
     assert not find_codes(labelled)

@@ -10,12 +10,12 @@ import pytest
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")
 
-from dask_cluster import DaskCluster, dask_cluster, die, die_once, spend, wants_more, where
+from dask_cluster import DaskCluster, dask_cluster, die, die_once, wants_more, where
 
 import tcpipe
 from tcpipe import execution
 from tcpipe.errors import TcpipeError, UsageError
-from tcpipe.execution import read_cluster_cpu_s, run_all
+from tcpipe.execution import run_all
 from tcpipe.progress import STEP, Step, step_of
 
 
@@ -73,25 +73,6 @@ def test_what_a_worker_or_the_scheduler_lacks_is_one_line(cluster, tmp_path, mon
         UsageError, match=r"tcp://.*: the scheduler lacks tcpipe; install the same packages there as here"
     ):
         list(run_all(task, [1], jobs=1, cluster=cluster.address))
-
-
-def test_a_worker_without_tcpipe_is_refused_at_once(tmp_path, monkeypatch):
-    (tmp_path / "none" / "tcpipe").mkdir(parents=True)
-    (tmp_path / "none" / "tcpipe" / "__init__.py").write_text("raise ModuleNotFoundError('there is none')\n")
-    with dask_cluster(tmp_path, workers=0) as bare:
-        monkeypatch.setenv("PYTHONPATH", str(tmp_path / "none"))
-        monkeypatch.chdir(tmp_path)  # where `python -m dask` looks before all
-        bare.start_worker()
-        with pytest.raises(
-            UsageError, match=r"tcp://.*: a worker lacks tcpipe \(there is none\); install the same packages"
-        ):
-            list(run_all(where, [1], jobs=1, cluster=bare.address))
-
-
-def test_what_workers_spend_counts_here(cluster):
-    before_s = read_cluster_cpu_s()
-    assert [outcome.result for outcome in run_all(spend, [0.1, 0.1], jobs=1, cluster=cluster.address)] == [None, None]
-    assert 0.2 <= read_cluster_cpu_s() - before_s < 2.0
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):

@@ -1,16 +1,11 @@
 """The record of a run: what does not fit is named by file and key, and each fact is written once."""
 
-import re
 from dataclasses import replace
 
 import pytest
 from synthetic_store import add_run, lanes, make_fuse_facts, segments, supersede
 
-from tcpipe.errors import StoreError
-from tcpipe.formats.documents import Name, read_record
-from tcpipe.formats.integrity import compute_short_digest
-from tcpipe.formats.json_files import parse_json, to_json
-from tcpipe.formats.runs import Run
+from tcpipe.formats.json_files import parse_json
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Subject, make_finding
 
@@ -28,33 +23,6 @@ def store(tmp_path):
 def read_plain(store):
     (run,) = store.runs()
     return parse_json(store.place.read(run.document), run.document)
-
-
-@pytest.mark.parametrize(
-    ("keys", "line"),
-    [
-        (("counts", "segments"), "counts.segments: expected a whole number, got a list"),
-        (("distance_by_reason_m", "kept"), "distance_by_reason_m[...]: expected a number, got a list"),
-        (
-            ("info", "report", "facts", "fuse", "rows"),
-            "info.report.facts.fuse.rows: expected a whole number, got a list",
-        ),
-        (("info", "datum"), "info.datum: expected an object or null, got a list"),
-        (("log",), "log: expected an object, got a list"),
-    ],
-)
-def test_a_value_of_another_type_is_named_by_file_and_key(store, keys, line):
-    document = read_plain(store)
-    place = document
-    for key in keys[:-1]:
-        place = place[key]
-    place[keys[-1]] = []
-    data = to_json(document).encode()
-    name = str(Name("runs", "0" * 16, 1, compute_short_digest(data)))
-    store.place.put(name, data)
-    where = re.escape(f"{store.place.where(name)}: is not what this version writes: {line}")
-    with pytest.raises(StoreError, match=f"^{where}$"):
-        read_record(store.place, name, Run)
 
 
 def test_a_finding_is_written_once_and_is_there_again_in_what_is_read(store):

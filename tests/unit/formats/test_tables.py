@@ -8,7 +8,7 @@ import pytest
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.table_log import read_cells, read_table_header
-from tcpipe.formats.logs.table_stamps import choose_clock, read_clock
+from tcpipe.formats.logs.table_stamps import read_clock
 
 
 def ns(*time):
@@ -96,17 +96,3 @@ def test_what_is_no_table_is_one_plain_line(tmp_path, name, content):
     (problem,) = caught.value.problems
     assert problem.startswith(str(tmp_path / name))
     assert "\n" not in problem
-
-
-@pytest.mark.parametrize(
-    "column",
-    [
-        pl.Series("time", [None, None], dtype=pl.Time),
-        pl.Series("time", [1, 2]).cast(pl.Duration("ns")),
-        pl.Series("time", [[1], [2]]),
-    ],
-)
-def test_columns_of_parquet_without_stamps_are_no_clock(column):
-    assert "neither numbers nor dates" in read_clock(column)
-    dates = pl.Series("date", ["2025-10-14"] * 2)
-    assert choose_clock({"date": dates, "time": column}) is None
