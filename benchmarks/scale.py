@@ -38,11 +38,13 @@ HOURS, SAMPLES, CORES, MEMORY_GB = 100_000, 10**9, 64, 256
 LOGS_PER_HOUR = 5
 NAME = "drive_{:04d}.mcap"
 MOST_HZ = 50
+SCENARIO = "hills12"
+"""Drive that is repeated by default: twelve minutes over hills."""
 SMALL = 1e-4
 """Noise of a repeated value over its spread [1]: another measurement of the same drive."""
 
 
-def write_logs(directory: Path, hours: int, scenario: str) -> list[Path]:
+def write_logs(directory: Path, hours: int, scenario: str = SCENARIO) -> list[Path]:
     """Return logs of so many hours; those that are not there yet are written, at ten CPU seconds an hour."""
     from tcpipe.formats.logs.writing import write_mcap
 
@@ -55,7 +57,7 @@ def write_logs(directory: Path, hours: int, scenario: str) -> list[Path]:
     return paths
 
 
-def drive_streams(scenario: str) -> list[MessageStream]:
+def drive_streams(scenario: str = SCENARIO) -> list[MessageStream]:
     """Return what is recorded of the drive, at most `MOST_HZ` of each topic: hours are to be had in minutes."""
     from tcpipe.simulation.scenarios import find_scenario
     from tcpipe.simulation.site_files import simulate_messages
@@ -84,7 +86,7 @@ def later(stream: MessageStream, seconds: int, *, seed: int) -> MessageStream:
     return replace(stream, columns=columns, log_time_ns=at, publish_time_ns=said)
 
 
-def ingest_hours(directory: Path, hours: int = 20, jobs: int = 2, scenario: str = "hills12") -> None:
+def ingest_hours(directory: Path, hours: int = 20, jobs: int = 2, scenario: str = SCENARIO) -> None:
     """Ingest that many hours, and print what each took."""
     with ProcessPoolExecutor(
         1, mp_context=get_context("spawn")
