@@ -25,12 +25,8 @@ from tcpipe.geometry.rotation import (
 from tcpipe.robust import MEDIAN_OF_SQUARES
 
 STATED_MOUNTING_STD_RAD, UNSTATED_MOUNTING_STD_RAD = 0.0175, 0.1
-_DEFAULT_STD_RAD = 0.01  # scan matching and visual SLAM state none, or any
-_FLOOR_STD_RAD = 0.003  # no localization is better
-_FLAT = 1e-6  # of the lowest row of the rotation matrices: a pose in the plane has yaw alone
 _FEWEST = 20  # attitudes, and chords
-_CHORD_NS, _CHORD_M, _STRAIGHT_RAD = 1_000_000_000, 0.3, 0.1  # duration, least length, largest turn of a chord
-_MISSTATED_RAD = 0.25  # slopes that the robot drives along look like half of that
+_CHORD_NS = 1_000_000_000
 
 
 def add_attitude(
@@ -52,10 +48,11 @@ def add_attitude(
     grid_north_rad = np.angle(np.sum(east * np.conj(frame)))
     quat = multiply(multiply(quat_from_rpy(0.0, 0.0, grid_north_rad), quat_xyzw), invert(mounting_xyzw))
     shown = np.median(np.square(np.diff(compute_turns(quat[known]), axis=0)), axis=0) / MEDIAN_OF_SQUARES / 6.0
-    stated = np.where(np.isfinite(variance_rad2), variance_rad2, _DEFAULT_STD_RAD**2)
+    # Scan matching and visual SLAM state none, or any; no localization is better than 3 mrad.
+    stated = np.where(np.isfinite(variance_rad2), variance_rad2, 0.01**2)
     stated[:, :2] = stated[:, :2].mean(1, keepdims=True)  # of roll and pitch, whatever the yaw
-    variance = np.maximum(stated, np.maximum(shown, _FLOOR_STD_RAD**2))
-    if np.ptp(matrix_from_quat(quat_xyzw[known])[:, 2], axis=0).max() < _FLAT:
+    variance = np.maximum(stated, np.maximum(shown, 0.003**2))
+    if np.ptp(matrix_from_quat(quat_xyzw[known])[:, 2], axis=0).max() < 1e-6:  # a pose in the plane has yaw alone
         variance[:, :2] = UNMEASURED_RAD2
     return replace(
         fixes,
@@ -88,7 +85,7 @@ def align_mounting(fixes: Positions, odometry: BodyVelocities | None, *, is_stat
     way = fixes.position_enu_m[last] - fixes.position_enu_m[first]
     length = np.linalg.norm(way, axis=1)
     turned = np.linalg.norm(rotation_vector_from_quat(multiply(invert(quat[first]), quat[last])), axis=1)
-    straight = (length > _CHORD_M) & (turned < _STRAIGHT_RAD) & (stamp_ns[last] - stamp_ns[first] < 2 * _CHORD_NS)
+    straight = (length > 0.3) & (turned < 0.1) & (stamp_ns[last] - stamp_ns[first] < 2 * _CHORD_NS)
     if straight.sum() < _FEWEST:
         return without
     middle = (first + last)[straight] // 2
@@ -103,7 +100,7 @@ def align_mounting(fixes: Positions, odometry: BodyVelocities | None, *, is_stat
         return without
     x, y = ahead / np.linalg.norm(ahead), aside / np.linalg.norm(aside)
     turn = quat_from_matrix(np.stack((x, y, np.cross(x, y))))
-    if is_stated and np.linalg.norm(rotation_vector_from_quat(turn)) < _MISSTATED_RAD:
+    if is_stated and np.linalg.norm(rotation_vector_from_quat(turn)) < 0.25:  # slopes look like half of that
         return fixes
     mounting = tuple(multiply(turn, fixes.mounting_xyzw).tolist())
     quat = multiply(quat, invert(turn))

@@ -8,7 +8,7 @@ measurement beyond the gate counts as the gate, less a cost by kind.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -18,29 +18,31 @@ from numpy.typing import NDArray
 from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import NoiseModel
-from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, Tests
+from tcpipe.fusion.filter_kernel import Tests, Verdict
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, Residuals
 from tcpipe.fusion.parameters import FIX_AXES, Event
 from tcpipe.fusion.signals import SPIKE_RATIO, compute_running_median
+from tcpipe.fusion.state import Error, Kind
 from tcpipe.fusion.ticks import Ticks
+from tcpipe.robust import MIN_SIGMAS
 from tcpipe.tables.findings import read_threshold
 
-ROLES = {
-    state.WHEELS: WHEELS,
-    state.VISUAL: VISUAL,
-    state.STATIONARY_RATE: IMU,
-    state.DOPPLER: DOPPLER,
-    state.FIX: GNSS,
-    state.ATTITUDE: GNSS,
+ROLES: Mapping[int, str] = {
+    Kind.WHEELS: WHEELS,
+    Kind.VISUAL: VISUAL,
+    Kind.STATIONARY_RATE: IMU,
+    Kind.DOPPLER: DOPPLER,
+    Kind.FIX: GNSS,
+    Kind.ATTITUDE: GNSS,
 }
 """Sensors by the kind of their measurements."""
 POSSIBLE = (
-    *range(state.ARM, state.FIX_OFFSET + 3),
-    state.WHEEL_SCALE,
-    state.VISUAL_SCALE,
-    state.WHEEL_LAG,
-    state.VISUAL_LAG,
+    *range(Error.ARM, Error.FIX_OFFSET + 3),
+    Error.WHEEL_SCALE,
+    Error.VISUAL_SCALE,
+    Error.WHEEL_LAG,
+    Error.VISUAL_LAG,
 )
 """Errors that changes change, beside those that always vary."""
 
@@ -61,53 +63,37 @@ def _make_kind(place: int, count: int, std: float, cost: float, least: float) ->
     return EventKind(tuple((place + i, std) for i in range(count)), cost, least)
 
 
-EVENTS = {
-    ("offset", state.FIX): _make_kind(state.FIX_OFFSET, 3, 1.0, 12.0, 0.05),
-    ("antenna", state.FIX): _make_kind(state.ARM, 3, 0.3, 40.0, 0.05),
-    ("clock", state.FIX): _make_kind(state.FIX_LAG, 1, 0.3, 14.0, 0.05),
-    ("clock", state.WHEELS): _make_kind(state.WHEEL_LAG, 1, 0.3, 14.0, 0.05),
-    ("clock", state.VISUAL): _make_kind(state.VISUAL_LAG, 1, 0.3, 14.0, 0.05),
-    ("gyroscope", state.STATIONARY_RATE): _make_kind(state.GYRO_BIAS, 3, 0.03, 16.0, 0.003),
-    ("scale", state.WHEELS): _make_kind(state.WHEEL_SCALE, 1, 0.3, 10.0, 0.15),
-    ("scale", state.VISUAL): _make_kind(state.VISUAL_SCALE, 1, 0.3, 10.0, 0.15),
-    ("frame", state.ATTITUDE): _make_kind(state.POSE_FRAME, 3, 0.3, 14.0, 0.05),
-    ("pose", state.FIX): EventKind(
+EVENTS: Mapping[tuple[str, int], EventKind] = {
+    ("offset", Kind.FIX): _make_kind(Error.FIX_OFFSET, 3, 1.0, 12.0, 0.05),
+    ("antenna", Kind.FIX): _make_kind(Error.ARM, 3, 0.3, 40.0, 0.05),
+    ("clock", Kind.FIX): _make_kind(Error.FIX_LAG, 1, 0.3, 14.0, 0.05),
+    ("clock", Kind.WHEELS): _make_kind(Error.WHEEL_LAG, 1, 0.3, 14.0, 0.05),
+    ("clock", Kind.VISUAL): _make_kind(Error.VISUAL_LAG, 1, 0.3, 14.0, 0.05),
+    ("gyroscope", Kind.STATIONARY_RATE): _make_kind(Error.GYRO_BIAS, 3, 0.03, 16.0, 0.003),
+    ("scale", Kind.WHEELS): _make_kind(Error.WHEEL_SCALE, 1, 0.3, 10.0, 0.15),
+    ("scale", Kind.VISUAL): _make_kind(Error.VISUAL_SCALE, 1, 0.3, 10.0, 0.15),
+    ("frame", Kind.ATTITUDE): _make_kind(Error.POSE_FRAME, 3, 0.3, 14.0, 0.05),
+    ("pose", Kind.FIX): EventKind(
         tuple(
-            (place + i, std) for place, std in ((state.RHO, 2.0), (state.THETA, 0.1), (state.U, 0.5)) for i in range(3)
+            (place + i, std) for place, std in ((Error.RHO, 2.0), (Error.THETA, 0.1), (Error.U, 0.5)) for i in range(3)
         ),
         20.0,
         1.0,
     ),
 }
 """Events by their name and the sensor that they are of."""
-LARGER_ERRORS = {
-    ("noise", state.FIX): (0.03, 0.06, 0.12, 0.24),  # m, from RTK's usual error to a wrong ambiguity
-    ("slow", state.FIX): (0.03, 0.06, 0.12, 0.24),
-    ("varies", state.WHEELS): (0.05, 0.1, 0.2),  # of the scale, with slope, ground or load
-    ("varies", state.VISUAL): (0.05, 0.1, 0.2),
-    ("accelerometer", state.STATIONARY_RATE): (0.1, 0.3, 1.0),  # m/s²: its bias follows speed or temperature
+LARGER_ERRORS: Mapping[tuple[str, int], tuple[float, ...]] = {
+    ("noise", Kind.FIX): (0.03, 0.06, 0.12, 0.24),  # m, from RTK's usual error to a wrong ambiguity
+    ("slow", Kind.FIX): (0.03, 0.06, 0.12, 0.24),
+    ("varies", Kind.WHEELS): (0.05, 0.1, 0.2),  # of the scale, with slope, ground or load
+    ("varies", Kind.VISUAL): (0.05, 0.1, 0.2),
+    ("accelerometer", Kind.STATIONARY_RATE): (0.1, 0.3, 1.0),  # m/s²: its bias follows speed or temperature
 }
 """Errors that may be larger than usual throughout a section, by their name and sensor, and the sizes that are tried [their unit], 1σ."""
 _VARIES_S = 5.0
 """Correlation time of a scale or a bias that varies [s]."""
-_STEP_COST = 12.0
-"""Log of how unlikely a step of fixes is beforehand [nat]."""
-_STD_FACTOR = 3.0
-"""Factor of the standard deviation of an estimated change [1]: the filter estimates it again from the same measurements."""
-_NOISE_S = 1.5
-"""Correlation time of a larger noise of fixes [s]: reflected signals change as the antenna moves by a metre."""
-_SLOW_S = 60.0
-"""Correlation time of a slow error of fixes [s]: the paths of reflected signals change with the satellites."""
-_REJECTED_S = {state.FIX: 1.0, state.WHEELS: 4.0, state.VISUAL: 4.0, state.ATTITUDE: 4.0}
+_REJECTED_S: Mapping[int, float] = {Kind.FIX: 1.0, Kind.WHEELS: 4.0, Kind.VISUAL: 4.0, Kind.ATTITUDE: 4.0}
 """How long a sensor that is not wrong may be rejected without a break [s]: wheels slip for seconds."""
-_MIN_REJECTIONS = 5
-"""Rejections in a row that are no single outliers [1]."""
-_MEDIAN_ROWS = 7
-"""Measurements whose median one of them is compared with [1]."""
-_SAME_EVENT_TICKS = 20
-"""Ticks between two events of one block, below which they are one event [1]."""
-_MAX_REST = 0.4
-"""Share of a change that a later, opposite one leaves if it ends the change [1]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,17 +116,18 @@ class Change:
         """Log of how unlikely it is beforehand."""
         if (self.kind, self.role) in EVENTS:
             return EVENTS[self.kind, self.role].cost + (0.0 if self.last is None else 2.0)
-        return _STEP_COST if self.kind == "step" else 0.0
+        return EVENTS["offset", Kind.FIX].cost if self.kind == "step" else 0.0
 
     def list_events(self) -> Iterator[Event]:
         """Yield what it changes in the state."""
         if self.kind == "step":  # drawn from the prior that `Hypothesis.alter_priors` gives
-            yield from (Event(self.first, state.FIX_OFFSET + axis, is_new=True) for axis in range(3))
+            yield from (Event(self.first, Error.FIX_OFFSET + axis, is_new=True) for axis in range(3))
         elif (self.kind, self.role) in EVENTS:
             block = EVENTS[self.kind, self.role].block
             for (place, prior_std), found, found_std in zip(block, self.impulse, self.impulse_std, strict=True):
-                is_pose = place < state.GYRO_BIAS  # its errors are along axes that the change turns: they have no mean
-                std, mean = (prior_std, 0.0) if is_pose else (min(prior_std, _STD_FACTOR * found_std), found)
+                is_pose = place < Error.GYRO_BIAS  # its errors are along axes that the change turns: they have no mean
+                # The filter estimates the others again from the same measurements: three of their σ.
+                std, mean = (prior_std, 0.0) if is_pose else (min(prior_std, 3.0 * found_std), found)
                 yield Event(self.first, place, std, mean)
                 if self.last is not None:
                     yield (
@@ -157,7 +144,7 @@ class Change:
         kept, noise, variance = inputs.fix_kept.copy(), inputs.fix_noise.copy(), ticks.fix_variance_m2.copy()
         first, last = self.first, kept.size if self.last is None else self.last
         if self.kind == "noise":
-            kept[:] = np.exp(-inputs.period_s / _NOISE_S)
+            kept[:] = np.exp(-inputs.period_s / 1.5)  # s: reflected signals change as the antenna moves by a metre
         variance[first:last] = np.maximum(variance[first:last], np.square(self.size * FIX_AXES))
         if last < kept.size:
             kept[last] *= np.sqrt(variance[last, 0] / variance[last - 1, 0])
@@ -186,17 +173,17 @@ class Hypothesis:
 
     def alter_priors(self, std: Floats, walk: Floats, time_s: Floats) -> None:
         """Alter standard deviation, walk and correlation time of every error, shapes (45,), to those under all changes."""
-        offset = slice(state.FIX_OFFSET, state.FIX_OFFSET + 3)
+        offset = slice(Error.FIX_OFFSET, Error.FIX_OFFSET + 3)
         for change in self.changes:
             if change.kind in {"step", "slow"}:  # either side of a step may be right: both are off by half of it, 1σ
                 share = 0.5 if change.kind == "step" else 1.0
                 std[offset] = np.maximum(std[offset], share * change.size * FIX_AXES)
-                time_s[offset] = _SLOW_S
+                time_s[offset] = 60.0  # the paths of reflected signals change with the satellites
             elif change.kind == "varies":
-                slip = state.WHEEL_SLIP if change.role == state.WHEELS else state.VISUAL_SLIP
+                slip = Error.WHEEL_SLIP if change.role == Kind.WHEELS else Error.VISUAL_SLIP
                 std[slip], time_s[slip] = change.size, _VARIES_S
             elif change.kind == "accelerometer":
-                bias = slice(state.ACCELEROMETER_BIAS, state.ACCELEROMETER_BIAS + 3)
+                bias = slice(Error.ACCELEROMETER_BIAS, Error.ACCELEROMETER_BIAS + 3)
                 std[bias], walk[bias], time_s[bias] = change.size, 0.0, _VARIES_S
 
 
@@ -204,8 +191,8 @@ def is_contradicted(tests: Tests, period_s: float) -> bool:
     """Return whether a sensor is rejected more often, or longer without a break, than one that is not wrong."""
     most = read_threshold("measurements-rejected", "max_rejected_fraction")
     for kind in _REJECTED_S:
-        rows = np.flatnonzero(tests.verdict[:, kind] != NONE)
-        rejected = tests.verdict[rows, kind] != ACCEPTED
+        rows = np.flatnonzero(tests.verdict[:, kind] != Verdict.NONE)
+        rejected = tests.verdict[rows, kind] != Verdict.ACCEPTED
         if rejected.sum() > most * rows.size or _find_long_runs(rows, rejected, period_s, kind):
             return True
     return False
@@ -218,12 +205,12 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
     explain.
     """
     value = ticks.inputs.value.copy()
-    for kind in (state.WHEELS, state.VISUAL, state.FIX):
+    for kind in (Kind.WHEELS, Kind.VISUAL, Kind.FIX):
         rows, axes = np.flatnonzero(np.isfinite(value[:, kind, 0])), slice(state.SIZES[kind])
         if rows.size:
-            series = tests.fix_innovation[rows] if kind == state.FIX else value[rows, kind, axes]
+            series = tests.fix_innovation[rows] if kind == Kind.FIX else value[rows, kind, axes]
             is_spike = _find_spikes(series, np.sqrt(ticks.inputs.variance[rows, kind, axes]))
-            rejected = tests.verdict[rows, kind] != ACCEPTED
+            rejected = tests.verdict[rows, kind] != Verdict.ACCEPTED
             for first, last in _find_long_runs(rows, rejected, ticks.inputs.period_s, kind):
                 rejected[first:last] = False
             value[rows[is_spike | rejected], kind] = np.nan
@@ -232,7 +219,7 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
 
 def _find_spikes(series: Floats, least: Floats) -> NDArray[np.bool_]:
     """Return which rows of a series (N, k) are spikes; the usual distance from the median around is ``least`` (N, k) or more."""
-    off = np.abs(series - compute_running_median(series, _MEDIAN_ROWS))
+    off = np.abs(series - compute_running_median(series, 7))
     return np.asarray((off > SPIKE_RATIO * np.maximum(np.median(off, axis=0), least)).any(axis=1))
 
 
@@ -244,7 +231,7 @@ def _find_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 def _find_long_runs(rows: Ints, mask: NDArray[np.bool_], period_s: float, kind: int) -> list[tuple[int, int]]:
     """Return those runs of measurements at some ticks that last longer than a sensor that is not wrong may be rejected."""
-    runs = [run for run in _find_runs(mask) if run[1] - run[0] >= _MIN_REJECTIONS]
+    runs = [run for run in _find_runs(mask) if run[1] - run[0] >= 5]  # fewer are single outliers
     return [(first, last) for first, last in runs if (rows[last - 1] - rows[first] + 1) * period_s >= _REJECTED_S[kind]]
 
 
@@ -253,7 +240,7 @@ def join_events(events: Sequence[Change]) -> tuple[Change, ...]:
     single: list[Change] = []
     for event in sorted(events, key=lambda each: (each.kind, each.role, each.first)):
         before = single[-1] if single and (single[-1].kind, single[-1].role) == (event.kind, event.role) else None
-        if before is not None and event.first - before.first < _SAME_EVENT_TICKS:
+        if before is not None and event.first - before.first < 20:  # ticks
             single[-1] = replace(before, impulse=tuple(np.add(before.impulse, event.impulse).tolist()))
         else:
             single.append(event)
@@ -262,7 +249,7 @@ def join_events(events: Sequence[Change]) -> tuple[Change, ...]:
         before = joined[-1] if joined and (joined[-1].kind, joined[-1].role) == (event.kind, event.role) else None
         if before is not None and before.last is None:
             rest = np.linalg.norm(np.add(before.impulse, event.impulse))
-            if rest < _MAX_REST * np.linalg.norm(before.impulse):
+            if rest < 0.4 * np.linalg.norm(before.impulse):
                 joined[-1] = replace(before, last=event.first)
                 continue
         joined.append(event)
@@ -272,16 +259,12 @@ def join_events(events: Sequence[Change]) -> tuple[Change, ...]:
 
 def compute_evidence(tests: Tests, gates: Floats) -> float:
     """Return the log likelihood of all measurements; one beyond the gate counts as the gate."""
-    kinds = [state.WHEELS, state.VISUAL, state.DOPPLER, state.FIX, state.ATTITUDE]
+    kinds = [Kind.WHEELS, Kind.VISUAL, Kind.DOPPLER, Kind.FIX, Kind.ATTITUDE]
     return float(-0.5 * np.nansum(np.minimum(tests.nis[:, kinds], gates[kinds]) + tests.log_det[:, kinds]))
 
 
-_EXCURSION_STDS, _MAX_EXCURSION_RATIO = 4.0, 2.0
-"""Standard deviations of a residual that noise does not reach, and ratio of the residuals of two odometries that confirm each other [1]."""
-_MIN_RESIDUAL_VARIANCE = 1e-6
-"""Least variance of a residual [m²]; a pair of sensors without densities has none of its own."""
-_MIN_EXCURSION_WINDOWS, _SHORT_WINDOW_S, _EXCURSION_WINDOW_S = 3, 4.0, 8.0
-"""Overlapping windows [1], the shortest that are compared [s], and the longest of a step or of a wrong lever arm in a turn [s]."""
+_EXCURSION_WINDOW_S = 8.0
+"""Longest window of a step, or of a wrong lever arm in a turn [s]."""
 
 
 def find_excursions(residuals: Sequence[Residuals], noise: NoiseModel, ticks: Ticks) -> tuple[Change, ...]:
@@ -291,7 +274,7 @@ def find_excursions(residuals: Sequence[Residuals], noise: NoiseModel, ticks: Ti
     beyond, there is a step.
     """
     size = ticks.stamp_ns.size
-    of_fixes = [each for each in residuals if GNSS in each.pair and each.time_s > _SHORT_WINDOW_S]
+    of_fixes = [each for each in residuals if GNSS in each.pair and each.time_s > 4.0]
     found = sorted(
         (run for pair in combinations(of_fixes, 2) for run in _find_excursion_runs(*pair, noise)), reverse=True
     )
@@ -302,7 +285,7 @@ def find_excursions(residuals: Sequence[Residuals], noise: NoiseModel, ticks: Ti
             spans.append((*np.searchsorted(ticks.stamp_ns, (start_ns, end_ns)).clip(0, size).tolist(), off_m))
     changes: list[Change] = []
     for first, last, off_m in sorted(spans):
-        before = changes.pop() if changes and first < (changes[-1].last or size) else Change("wander", state.FIX, first)
+        before = changes.pop() if changes and first < (changes[-1].last or size) else Change("wander", Kind.FIX, first)
         end, largest_m = max(last, before.last or 0), max(off_m, before.size)
         changes.append(replace(before, last=None if end >= size else end, size=largest_m))
     return tuple(changes)
@@ -321,13 +304,11 @@ def _find_excursion_runs(
         sums = sum(
             (densities.get(name, 0.0) * factor for name, factor in each.features.items()), np.zeros(each.value.size)
         )
-        value[k], variance[k] = each.value[rows[k]], sums[rows[k]] + _MIN_RESIDUAL_VARIANCE
+        value[k], variance[k] = each.value[rows[k]], sums[rows[k]] + 1e-6  # m²: without densities there is none
     z2, ratio = (value**2 / variance).max(axis=0), value[0] / np.where(value[1], value[1], np.inf)
-    beyond = np.flatnonzero(
-        (z2 > _EXCURSION_STDS**2) & (ratio < _MAX_EXCURSION_RATIO) & (ratio > 1.0 / _MAX_EXCURSION_RATIO)
-    )
+    beyond = np.flatnonzero((z2 > MIN_SIGMAS**2) & (ratio < 2.0) & (ratio > 0.5))  # both odometries confirm each other
     end_ns = one.end_ns[rows[0]]
     for run in np.split(beyond, np.flatnonzero(start_ns[beyond][1:] >= end_ns[beyond][:-1]) + 1):
-        if run.size >= _MIN_EXCURSION_WINDOWS:
+        if run.size >= 3:  # windows that overlap
             off_m = float(np.abs(value[0, run]).max())
             yield float(z2[run].max()), one.time_s, int(start_ns[run[0]]), int(end_ns[run[-1]]), off_m

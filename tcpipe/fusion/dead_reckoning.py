@@ -83,10 +83,8 @@ def reckon_dead(m: Measurements, start_ns: int, bias_radps: float) -> DeadReckon
     return DeadReckoning(stamp_s, forward_mps, yaw_s[order], rate[order])
 
 
-_GRID_S, _WINDOWS_S, _STEP_S = 0.5, (1.0, 2.0, 4.0, 8.0, 16.0), 1e-6
-"""Grid of the course, baselines that are tried, and step between two rates [s]."""
-_MOVING_M, _MIN_BASELINE_STD, _MIN_MOVING_SHARE = 0.3, 3.0, 0.3
-"""Least baseline that shows a course [m], and in σ of fixes; share of usable baselines below which longer ones are tried [1] (rulings)."""
+_GRID_S = 0.5
+"""Time between two courses [s]."""
 
 
 def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_ns: int) -> tuple[Floats, Floats]:
@@ -98,9 +96,9 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
     stamp_s = compute_seconds(gnss.stamp_ns, zero_ns)
     grid_s = np.arange(stamp_s[0], stamp_s[-1], _GRID_S)
     std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
-    least_m = max(_MOVING_M, _MIN_BASELINE_STD * std_m)
+    least_m = max(0.3, 3.0 * std_m)  # a shorter baseline shows no course
     values = remove_wild_places(gnss.position_enu_m).view(np.float64).reshape(-1, 2)
-    for window_s in _WINDOWS_S:
+    for window_s in (1.0, 2.0, 4.0, 8.0, 16.0):
         rows = round(window_s / _GRID_S)
         if grid_s.size <= rows:
             return stamp_s[:1], np.zeros(1)
@@ -108,7 +106,7 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
         way = (means[rows:] - means[:-rows]) @ np.array([1.0, 1j])
         at_s = 0.5 * (grid_s[rows:] + grid_s[:-rows])
         moving = np.abs(way) > least_m
-        if moving.mean() > _MIN_MOVING_SHARE:
+        if moving.mean() > 0.3:
             break
     if odometry is not None:
         odometry_s = compute_seconds(odometry.stamp_ns, zero_ns)
@@ -121,7 +119,7 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
     course = np.unwrap(np.angle(way[moving]))
     at_s = at_s[moving]
     # Even turns in between, so that their integral is the course; before it first moves and after it last did, the robot does not turn.
-    stamp_s = np.repeat(at_s, 2) + np.tile([-_STEP_S, _STEP_S], at_s.size)
+    stamp_s = np.repeat(at_s, 2) + np.tile([-1e-6, 1e-6], at_s.size)
     rate = np.repeat(np.diff(course) / np.diff(at_s), 2)
     return stamp_s, np.concatenate(([0.0], rate, [0.0]))
 

@@ -33,13 +33,10 @@ from tcpipe.fusion.changes import (
 from tcpipe.fusion.dead_reckoning import compute_course
 from tcpipe.fusion.densities import PRIORS, NoiseModel, fit_noise, inflate_unclaimed_fixes
 from tcpipe.fusion.filter_kernel import (
-    ACCEPTED,
-    NONE,
-    REJECTED,
-    RESET,
     FilterModel,
     Memory,
     Tests,
+    Verdict,
     allocate_steps,
     filter_ticks,
 )
@@ -74,30 +71,18 @@ from tcpipe.fusion.smoother_kernel import (
     make_adjoint,
     smooth_ticks,
 )
+from tcpipe.fusion.state import Error, Kind
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
+from tcpipe.robust import MIN_SIGMAS
 from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding, read_threshold
 
-_LEVELLING_S = 60.0
-"""The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""
-_ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
-_JUDGED_M = 0.5  # fixes that claim more are not judged: motion carries the pose no better
 _UNCHANGED = Hypothesis(())
-_ARM_STDS, _SURE_STDS = 2.0, 4.0
-"""How far off an antenna is that is not where it is stated: deviations of the stated place, and of the estimate [1]."""
-_MAX_EVENTS = 6
-"""Events of a section [1]: two of them may be one change."""
 _BLOCK = 1024
 """Ticks between checkpoints."""
 _MIN_EVENT_GAIN = 20.0
 """Log evidence [nat] by which an event must explain more, beyond its cost: the best of a section's ticks reaches 12 by chance."""
-_SETTLING_S = 1.0
-"""Time after the start in which an event is an error of the start [s]."""
-_NEARLY_EXACT = 1e-4
-"""Standard deviation of errors that are known exactly, in their unit, where events are searched: sigma points need a width."""
-_LEAST_GAIN, _LEAST_FURTHER_GAIN = 100.0, 8.0
-"""Least gain in log likelihood [nat] by such an error, and by a larger one: gains are -5 to 59 on clean runs, above 1,000 on stepped."""
 
 
 def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_probability: float = 0.999) -> Trajectory:  # fmt: skip
@@ -116,7 +101,8 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     """
     section = prepare_section(m, output_ns, gate_probability)
     start, explanation = section.make_start(initial), _UNCHANGED
-    minute = round(_LEVELLING_S / section.ticks.inputs.period_s)
+    # The first minute is filtered twice: the second time from the attitude and yaw that it shows of its beginning.
+    minute = round(60.0 / section.ticks.inputs.period_s)
     levelled, _ = smooth_section(section.filter(start, until=minute), with_displacements=False)
     start.x[:9] = levelled.states[0, :9]
     made = section.filter(start)
@@ -147,7 +133,7 @@ def _can_tell_changes(m: Measurements) -> bool:
     carries = (
         bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
     )
-    return carries and float(np.median(m.gnss.variance_m2[:, 0])) < _JUDGED_M**2
+    return carries and float(np.median(m.gnss.variance_m2[:, 0])) < 0.5**2
 
 
 def prepare_section(m: Measurements, output_ns: Ints, gate_probability: float) -> SectionModel:
@@ -200,7 +186,7 @@ class SectionModel:
             exact = [
                 place for place, error in enumerate(model.active) if error in POSSIBLE and not begin.P[place, place]
             ]
-            begin.P[exact, exact] = _NEARLY_EXACT**2
+            begin.P[exact, exact] = 1e-4**2  # sigma points need a width
         return filter_section(ticks, model, begin, until=until)
 
     def prepare(
@@ -211,7 +197,7 @@ class SectionModel:
         std, walk, time_s = make_priors(self.measurements, self.noise, ticks)
         hypothesis.alter_priors(std, walk, time_s)
         if judges and self.measurements.imu is not None:  # a jump of the bias has made the walk that was fitted larger
-            walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = find_walk(PRIORS["imu bias"])
+            walk[Error.GYRO_BIAS : Error.GYRO_BIAS + 3] = find_walk(PRIORS["imu bias"])
         model = make_model(
             self.measurements,
             std,
@@ -228,12 +214,12 @@ class SectionModel:
     def is_arm_contradicted(self, made: Pass, smoothed: Smoothed) -> bool:
         """Return whether the section surely shows the antenna elsewhere than where it is stated."""
         gnss, active = self.measurements.gnss, list(made.model.active)
-        if gnss is None or state.ARM not in active:
+        if gnss is None or Error.ARM not in active:
             return False
-        off = np.abs(smoothed.states[-1, state.ARM + 6 : state.ARM + 9] - gnss.lever_arm_m)
-        place = active.index(state.ARM)
+        off = np.abs(smoothed.states[-1, Error.ARM + 6 : Error.ARM + 9] - gnss.lever_arm_m)
+        place = active.index(Error.ARM)
         known = smoothed.spreads[-1, place : place + 3]
-        return bool((off > np.maximum(_ARM_STDS * np.asarray(gnss.lever_arm_std_m), _SURE_STDS * known)).any())
+        return bool((off > np.maximum(2.0 * np.asarray(gnss.lever_arm_std_m), MIN_SIGMAS * known)).any())
 
     def forget_arm(self) -> SectionModel:
         """Return the section with an antenna whose place nothing states."""
@@ -275,12 +261,13 @@ class SectionModel:
                 for key, sizes in kinds.items()
             }
             top = max(tried, key=lambda key: tried[key][0].score)
-            if tried[top][0].score <= best[0].score + _LEAST_GAIN:
+            # Gains are -5 to 59 nat on clean runs, above 1,000 on stepped ones.
+            if tried[top][0].score <= best[0].score + 100.0:
                 break
             others, best = best[0].changes, tried[top]
             for size in kinds.pop(top)[1:]:
                 larger = self._judge((*others, Change(*top, 0, size=size)), start)
-                if larger[0].score <= best[0].score + _LEAST_FURTHER_GAIN:
+                if larger[0].score <= best[0].score + 8.0:
                     break
                 best = larger
         return best
@@ -288,7 +275,7 @@ class SectionModel:
     def _add_events(self, given: Hypothesis, tests: Tests, start: Memory) -> tuple[Hypothesis, Tests]:
         """Return a hypothesis with the events that explain most beyond it, found one after the other; ``tests`` are of its pass."""
         best, events = (given, tests), list[Change]()
-        for _ in range(_MAX_EVENTS):
+        for _ in range(6):  # two of them may be one change
             kept = drop_outliers(self.ticks, best[1])
             hypothesis = replace(given, changes=(*given.changes, *events))
             likely = smooth_section(self.filter(start, hypothesis, judges=True, kept=kept), with_displacements=False)[1]
@@ -374,7 +361,8 @@ def _list_candidates(made: Pass) -> tuple[list[tuple[str, int]], Candidates]:
         block = EVENTS[key].block
         sizes[row] = len(block)
         places[row, : len(block)], stds[row, : len(block)] = zip(*((position[e], std) for e, std in block), strict=True)
-    earliest, best = round(_SETTLING_S / made.ticks.inputs.period_s), np.full((shape[0], 2 + 2 * shape[1]), -np.inf)
+    best = np.full((shape[0], 2 + 2 * shape[1]), -np.inf)
+    earliest = round(1.0 / made.ticks.inputs.period_s)  # an event of the first second is an error of the start
     return possible, Candidates(places, stds, sizes, earliest, best)
 
 
@@ -412,7 +400,7 @@ def make_trajectory(
         rotation = matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw))
         rate = np.zeros((yaw.size, 3))
         rate[:, 2] = np.gradient(yaw, (output_ns - output_ns[0]) * 1e-9) if yaw.size > 1 else 0.0
-        yaw_variance = _ANY_YAW_STD_RAD**2 * speed_variance / (speed_variance + speed**2)
+        yaw_variance = (np.pi / np.sqrt(3.0)) ** 2 * speed_variance / (speed_variance + speed**2)
         position -= rotation @ antenna
         position_variance[:, :2] += (yaw_variance * np.sum(antenna[:2] ** 2))[:, None]
         speed_variance += (UNSEEN_TURN_RADPS * antenna[2]) ** 2
@@ -439,12 +427,12 @@ def make_trajectory(
 def _make_motion(x: Floats, ticks: Ticks, at: Ints) -> tuple[Floats, Floats, Floats]:
     """Return attitude of the robot, shape (N, 3, 3), velocity in ENU [m/s] and angular velocity in its axes [rad/s], shapes (N, 3)."""
     imu = x[:, :9].reshape(-1, 3, 3)
-    mount = x[:, state.MOUNT + 6 : state.MOUNT + 9]
+    mount = x[:, Error.MOUNT + 6 : Error.MOUNT + 9]
     rotation = imu + imu @ _make_skew(mount)
     rotation = matrix_from_quat(quat_from_matrix(rotation)) if mount.any() else imu
-    velocity = np.einsum("nij,nj->ni", imu, x[:, state.U + 6 : state.U + 9])
+    velocity = np.einsum("nij,nj->ni", imu, x[:, Error.U + 6 : Error.U + 9])
     gyro = ticks.inputs.has_gyro[at, None]
-    bias, scale = x[:, state.GYRO_BIAS + 6 : state.GYRO_BIAS + 9], x[:, state.TURN_SCALE + 6, None]
+    bias, scale = x[:, Error.GYRO_BIAS + 6 : Error.GYRO_BIAS + 9], x[:, Error.TURN_SCALE + 6, None]
     rate = (ticks.inputs.rate[at] - np.where(gyro, bias, 0.0)) * (1.0 - scale)
     return rotation, velocity, rate - np.cross(mount, rate)
 
@@ -484,7 +472,7 @@ def _list_rows(m: Measurements, made: Pass) -> Mapping[int, tuple[Ints, Ints]]:
 def _make_rejections(m: Measurements, made: Pass) -> Rejections:
     parts = []
     for kind, (stamp_ns, tick) in _list_rows(m, made).items():
-        refused = made.tests.verdict[tick, kind] == REJECTED
+        refused = made.tests.verdict[tick, kind] == Verdict.REJECTED
         parts.append((stamp_ns[refused], np.full(int(refused.sum()), ROLES[kind]), made.tests.nis[tick[refused], kind],
                       np.full(int(refused.sum()), made.model.gates[kind])))  # fmt: skip
     stamp_ns, role, nis, gate = (np.concatenate(values) for values in zip(*parts, strict=True))
@@ -495,15 +483,17 @@ def _make_rejections(m: Measurements, made: Pass) -> Rejections:
 def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     """Return each gate reset: since when the sensor was rejected, and its difference."""
     found = []
-    for kind, role in ((kind, role) for kind, role in ROLES.items() if kind != state.ATTITUDE):
+    for kind, role in ((kind, role) for kind, role in ROLES.items() if kind != Kind.ATTITUDE):
         verdict, stamp_ns = made.tests.verdict[:, kind], made.ticks.stamp_ns
-        for tick in np.flatnonzero(verdict == RESET):
-            heard = np.flatnonzero((verdict[:tick] != REJECTED) & (verdict[:tick] != NONE))
-            since = np.flatnonzero(verdict[heard[-1] + 1 : tick] == REJECTED) + heard[-1] + 1 if heard.size else []
+        for tick in np.flatnonzero(verdict == Verdict.RESET):
+            heard = np.flatnonzero((verdict[:tick] != Verdict.REJECTED) & (verdict[:tick] != Verdict.NONE))
+            since = (
+                np.flatnonzero(verdict[heard[-1] + 1 : tick] == Verdict.REJECTED) + heard[-1] + 1 if heard.size else []
+            )
             first = since[0] if len(since) else tick
             off = made.tests.fix_innovation[tick, :2]
-            if kind != state.FIX:  # the forward velocity of the tick before
-                off = made.ticks.inputs.value[tick, kind, :1] - made.states[max(int(tick) - 1, 0), state.U + 6]
+            if kind != Kind.FIX:  # the forward velocity of the tick before
+                off = made.ticks.inputs.value[tick, kind, :1] - made.states[max(int(tick) - 1, 0), Error.U + 6]
             size = float(np.linalg.norm(off))
             found.append(GateReset(role, int(stamp_ns[first]), int(stamp_ns[tick]), size))
     return tuple(sorted(found, key=lambda each: each.start_ns))
@@ -515,7 +505,7 @@ def _list_changes(made: Pass, smoothed: Smoothed, explained: Hypothesis) -> Iter
         last, size, role = change.last or made.states.shape[0] - 1, change.size, ROLES[change.role]
         if change.kind == "varies":
             places = (
-                (state.WHEEL_SCALE, state.WHEEL_SLIP) if role == WHEELS else (state.VISUAL_SCALE, state.VISUAL_SLIP)
+                (Error.WHEEL_SCALE, Error.WHEEL_SLIP) if role == WHEELS else (Error.VISUAL_SCALE, Error.VISUAL_SLIP)
             )
             size = float(smoothed.states[:, [place + 6 for place in places]].sum(axis=1).std())
         start_ns, end_ns = made.ticks.stamp_ns[[change.first, last]].tolist()
@@ -530,13 +520,13 @@ def _make_facts(  # noqa: PLR0917
     nis, verdicts = {}, {}
     for role in dict.fromkeys(ROLES[kind] for kind in rows):
         kinds = [kind for kind in rows if ROLES[kind] == role]
-        taken = np.concatenate([tests.nis[tests.verdict[:, kind] == ACCEPTED, kind] for kind in kinds])
+        taken = np.concatenate([tests.nis[tests.verdict[:, kind] == Verdict.ACCEPTED, kind] for kind in kinds])
         nis[role] = float(taken.mean()) / state.SIZES[kinds[0]] if taken.size else None
         verdicts[role] = np.concatenate([tests.verdict[rows[kind][1], kind] for kind in kinds])
     return StretchFacts(
         nis_mean=nis,
         measurements={role: int(verdict.size) for role, verdict in verdicts.items()},
-        rejected={role: int((verdict == REJECTED).sum()) for role, verdict in verdicts.items()},
+        rejected={role: int((verdict == Verdict.REJECTED).sum()) for role, verdict in verdicts.items()},
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, smoothed, explained)),
         common_scale_std=scale_std,
@@ -552,7 +542,7 @@ def _describe_parameters(m: Measurements, made: Pass, smoothed: Smoothed, std: F
         if not any(std[e] for e in errors):
             continue
         value = smoothed.states[-1, [e + 6 for e in errors]]
-        if parameter.place == state.ARM and m.gnss is not None:
+        if parameter.place == Error.ARM and m.gnss is not None:
             value = value - m.gnss.lever_arm_m
         spread = np.array([smoothed.spreads[-1, active.index(e)] if e in active else 0.0 for e in errors])
         prior = std[list(errors)]

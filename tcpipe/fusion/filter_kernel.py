@@ -11,6 +11,7 @@ Reference: M. Brossard et al., "A code for unscented Kalman filtering on manifol
 
 from __future__ import annotations
 
+from enum import IntEnum
 from math import log, sqrt
 from typing import Any, NamedTuple
 
@@ -19,21 +20,15 @@ from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion.state import (
-    ATTITUDE,
-    FIX,
-    FIX_ERROR,
-    GYRO_TURN,
     KINDS,
     MOVING,
     NX,
-    RHO,
     SIZES,
-    THETA,
-    VISUAL,
-    WHEELS,
+    Error,
+    Kind,
     Matrix,
+    Mode,
     N,
-    U,
     Vector,
     compute_moving_error,
     displace_state,
@@ -42,8 +37,12 @@ from tcpipe.fusion.state import (
     predict_measurement,
 )
 
-NONE, ACCEPTED, REJECTED, RESET = range(4)
-"""Verdicts of the gate. RESET: rejected for so long that the state is taken to be wrong, not the sensor."""
+
+class Verdict(IntEnum):
+    """Verdicts of the gate. RESET: rejected for so long that the state is taken to be wrong, not the sensor."""
+
+    NONE, ACCEPTED, REJECTED, RESET = range(4)
+
 
 Indices = NDArray[np.int64]
 
@@ -153,11 +152,8 @@ class Tests(NamedTuple):
     fix_innovation: Matrix
 
 
-MOTION_WITHOUT_GYRO, MOTION_WITH_GYRO = KINDS, KINDS + 1
-"""Rows of `Model.depends` beside the kinds of measurements."""
 MOST = MOVING + 1
 """Errors on which motion depends, at most."""
-_SILENT_S = 2.0
 _SPREAD = sqrt(3.0)  # matches the fourth moment of a normal distribution
 
 
@@ -214,7 +210,7 @@ def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, 
     """Carry x and P over the motion of tick k; F becomes the map of the errors on which it depends."""
     L, M, W, missed, d, high, low, centre, turn, up, down = room
     mode = inputs.mode[k]
-    row = MOTION_WITH_GYRO if mode >= GYRO_TURN else MOTION_WITHOUT_GYRO
+    row = KINDS + (mode >= Mode.GYRO_TURN)
     places, m, n = model.depends[row], model.counts[row], P.shape[0]
     move_state(x, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], centre, turn)
     factorize(P, places, m, L)
@@ -258,8 +254,8 @@ def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, 
             P[places[b], places[a]] = s
     x[:] = centre
     for e in range(3):  # rotation and velocity are always active, and first
-        P[THETA + e, THETA + e] += inputs.noise[k, e]
-        P[U + e, U + e] += inputs.noise[k, 3 + e]
+        P[Error.THETA + e, Error.THETA + e] += inputs.noise[k, e]
+        P[Error.U + e, Error.U + e] += inputs.noise[k, 3 + e]
 
 
 @compile_kernel
@@ -267,7 +263,7 @@ def _decay(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix,
     """Let parameters decay and wander over tick k; begin its events. ``kept`` becomes the share that stays of each error."""
     n = P.shape[0]
     for i in range(n):
-        is_fix_error = FIX_ERROR <= model.active[i] < FIX_ERROR + 3
+        is_fix_error = Error.FIX_ERROR <= model.active[i] < Error.FIX_ERROR + 3
         kept[i] = inputs.fix_kept[k] if is_fix_error else model.kept[i]
     for j in range(model.events.shape[0]):
         tick, place, is_new = model.events[j]
@@ -279,8 +275,8 @@ def _decay(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix,
             P[i] *= kept[i]
             P[:, i] *= kept[i]
         P[i, i] += model.noise[i]
-        if FIX_ERROR <= model.active[i] < FIX_ERROR + 3:
-            P[i, i] += inputs.fix_noise[k, model.active[i] - FIX_ERROR]
+        if Error.FIX_ERROR <= model.active[i] < Error.FIX_ERROR + 3:
+            P[i, i] += inputs.fix_noise[k, model.active[i] - Error.FIX_ERROR]
     for j in range(model.events.shape[0]):
         if model.events[j, 0] == k:
             place = model.events[j, 1]
@@ -305,7 +301,7 @@ def _compare(
     L, M, missed, d, high, turn, up, down = room[0], room[1], room[3], room[4], room[5], room[8], room[9], room[10]
     places, m, size, n = model.depends[kind], model.counts[kind], SIZES[kind], P.shape[0]
     rate, gyro, tau = inputs.rate[k], inputs.has_gyro[k], inputs.tau[k, kind]
-    lever = inputs.attitude[k] if kind == ATTITUDE else inputs.levers[kind]
+    lever = inputs.attitude[k] if kind == Kind.ATTITUDE else inputs.levers[kind]
     centre = S[0]
     predict_measurement(kind, x, rate, gyro, acceleration, tau, lever, centre)
     y[:] = centre
@@ -321,10 +317,12 @@ def _compare(
             M[a, i] = 0.5 / _SPREAD * (up[a] - down[a])
             for b in range(a + 1):
                 missed[a, b] += (0.5 * (up[a] + down[a]) - y[a]) * (0.5 * (up[b] + down[b]) - y[b]) / 3.0
-    if kind == FIX:  # the product of the errors of yaw and of the distance driven since the last fix is sideways
+    if kind == Kind.FIX:  # the product of the errors of yaw and of the distance driven since the last fix is sideways
         for a in range(3):
             for b in range(3):
-                missed[a, b] += P[THETA + 2, THETA + 2] * P[RHO, RHO] * x[3 * a + 1] * x[3 * b + 1]
+                missed[a, b] += (
+                    P[Error.THETA + 2, Error.THETA + 2] * P[Error.RHO, Error.RHO] * x[3 * a + 1] * x[3 * b + 1]
+                )
     _solve_for_map(M, size, L, m, Hs)
     for a in range(size):
         H[a], cross[a] = 0.0, 0.0
@@ -440,19 +438,19 @@ def _correct(x: Vector, P: Matrix, active: Indices, size: int, gain: Any, K: Mat
 @compile_kernel
 def _widen(kind: int, P: Matrix, y: Vector, size: int, scale: int) -> None:
     """Widen P where a sensor was rejected for long, so that it is heard again: the state has jumped, or the ``scale`` there (-1: none)."""
-    if kind == FIX:
-        P[THETA + 2, THETA + 2] += 0.1**2
+    if kind == Kind.FIX:
+        P[Error.THETA + 2, Error.THETA + 2] += 0.1**2
         for i in range(3):
-            P[RHO + i, RHO + i] += y[i] * y[i]
-            P[U + i, U + i] += 0.3**2
-    elif kind == ATTITUDE:
+            P[Error.RHO + i, Error.RHO + i] += y[i] * y[i]
+            P[Error.U + i, Error.U + i] += 0.3**2
+    elif kind == Kind.ATTITUDE:
         for i in range(3):
-            P[THETA + i, THETA + i] += y[i] * y[i]
+            P[Error.THETA + i, Error.THETA + i] += y[i] * y[i]
     elif scale >= 0:
         P[scale, scale] += 0.1**2
     else:
         for i in range(size):
-            P[U + i, U + i] += y[i] * y[i]
+            P[Error.U + i, Error.U + i] += y[i] * y[i]
 
 
 @compile_kernel
@@ -511,22 +509,22 @@ def filter_ticks(
             nis = _compute_nis(y, inverse, size)
             tests.nis[k, kind] = nis
             tests.log_det[k, kind] = log_det
-            verdict = ACCEPTED
-            if kind == FIX:
+            verdict = Verdict.ACCEPTED
+            if kind == Kind.FIX:
                 tests.fix_innovation[k] = y
             if not nis <= model.gates[kind]:
-                verdict = REJECTED
+                verdict = Verdict.REJECTED
                 waits[kind, 0] += 1.0
                 is_alone = True
-                for other in (WHEELS, VISUAL, FIX):
-                    is_alone = is_alone and (other == kind or waits[other, 1] > _SILENT_S)
+                for other in (Kind.WHEELS, Kind.VISUAL, Kind.FIX):
+                    is_alone = is_alone and (other == kind or waits[other, 1] > 2.0)  # s
                 patience_s = model.patience[kind, 2 if is_alone else 1]
                 if waits[kind, 0] >= model.patience[kind, 0] and waits[kind, 1] >= patience_s:
-                    verdict = RESET
+                    verdict = Verdict.RESET
                     _widen(kind, P, y, size, -1 if is_alone else model.scales[kind])
                     _compare(k, kind, inputs, model, x, P, acceleration, gain, room)
             tests.verdict[k, kind] = verdict
-            if verdict == REJECTED:
+            if verdict == Verdict.REJECTED:
                 continue
             waits[kind, 0] = 0.0
             waits[kind, 1] = 0.0

@@ -32,12 +32,6 @@ from tcpipe.fusion.signals import (
 )
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
-_MIN_COURSE_M = 5.0  # driven before course gives yaw (ruling)
-_MIN_COURSE_STD = 10.0  # distance over σ of fixes: yaw to 6°
-_MAX_WINDOW_S, _WINDOW_STEP_S = 120.0, 2.0  # longest window of fixes that shows the yaw; from one window to the next
-_GYRO_BIAS_STD_RADPS = 0.02  # turn-on bias of a MEMS gyroscope, 1°/s
-_POSED_YAW_STD_RAD = 0.1  # of a pose: its frame, and how its sensor is turned
-_ANY_SPEED_MPS = 2.0  # σ of a velocity that no sensor shows [m/s]
 _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
 
 
@@ -69,7 +63,7 @@ def _estimate_gyro_bias(imu: InertialMeasurements | None, stationary_ns: Ints) -
         inside = (imu.stamp_ns >= stationary_ns[0, 0]) & (imu.stamp_ns <= stationary_ns[0, 1])
         if inside.sum() >= 10:
             return imu.angular_velocity_radps[inside].mean(0), max(0.002, imu.gyro_std_radps / np.sqrt(inside.sum()))
-    return np.zeros(3), _GYRO_BIAS_STD_RADPS
+    return np.zeros(3), 0.02  # turn-on bias of a MEMS gyroscope, 1°/s
 
 
 def _estimate_tilt(imu: InertialMeasurements | None, stationary_ns: Ints, start_ns: int) -> tuple[float, float, float]:
@@ -103,7 +97,7 @@ class _Path:
     def start_velocity(self, yaw: float, pitch: float) -> tuple[Floats, float]:
         """Return the velocity at the start and its standard deviation [m/s]."""
         if not self.reckoned.forward_mps.size:
-            return np.zeros(3), _ANY_SPEED_MPS
+            return np.zeros(3), 2.0  # no sensor shows it
         speed, std_mps = float(np.median(self.reckoned.forward_mps[:5])), 0.3 if self._has_odometry else 1.0
         return speed * np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]), std_mps
 
@@ -134,7 +128,7 @@ def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_s
         return fit.yaw_rad, min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
     if gnss.quat_xyzw is not None and posed.size:  # the first attitude of a pose, less what the robot turned until then
         turned = path.reckoned.yaw(compute_seconds(gnss.stamp_ns[posed], start_ns))
-        return float(rpy_from_quat(gnss.quat_xyzw[posed[0]])[2] - turned[0]), _POSED_YAW_STD_RAD, "pose"
+        return float(rpy_from_quat(gnss.quat_xyzw[posed[0]])[2] - turned[0]), 0.1, "pose"
     return own, _UNKNOWN_YAW_STD_RAD, source or "unknown"
 
 
@@ -153,11 +147,11 @@ def _fit_course(gnss: Positions, path: _Path) -> _Fit | None:
     stamp_s = compute_seconds(gnss.stamp_ns, path.start_ns)
     fixes = remove_wild_places(gnss.position_enu_m)
     noise = float(np.median(np.sqrt(gnss.variance_m2[:, :2].mean(1))))
-    wanted = max(_MIN_COURSE_M, _MIN_COURSE_STD * noise)
+    wanted = max(5.0, 10.0 * noise)  # [m]: yaw to 6°
     drawn = path.antenna(stamp_s)
     found: list[_Fit] = []
-    for first in np.unique(np.searchsorted(stamp_s, np.arange(stamp_s[0], stamp_s[-1], _WINDOW_STEP_S))):
-        near = slice(first, int(np.searchsorted(stamp_s, stamp_s[first] + _MAX_WINDOW_S, "right")))
+    for first in np.unique(np.searchsorted(stamp_s, np.arange(stamp_s[0], stamp_s[-1], 2.0))):
+        near = slice(first, int(np.searchsorted(stamp_s, stamp_s[first] + 120.0, "right")))
         far = np.flatnonzero(np.abs(fixes[near] - fixes[first]) >= wanted)
         if far.size == 0:
             continue
@@ -201,13 +195,6 @@ def _estimate_position(gnss: Positions | None, path: _Path, quat: Floats, yaw: f
 
 
 _WINDOW_NS = 500_000_000  # window of means and scatter
-_MAX_WHEEL_MPS = 0.02  # mean over the window; single samples are noisy
-_MAX_WHEEL_SPREAD_MPS = 0.06  # encoders at rest; judged
-_MAX_SAMPLE_MPS = 0.2  # no stationary sample is faster
-_MAX_BIAS_RADPS = 0.05  # a gyroscope at rest may show this much
-_MIN_SPREAD_RADPS = 0.012  # gyroscope noise at rest; judged
-_MIN_LENGTH_NS = 600_000_000  # shorter stops do not count
-_MARGIN_NS = 150_000_000  # removed at both ends: rocking
 
 
 def find_stationary_intervals(measurements: Measurements) -> Ints:
@@ -220,10 +207,10 @@ def find_stationary_intervals(measurements: Measurements) -> Ints:
         return np.empty((0, 2), np.int64)
     stamp = wheels.stamp_ns
     # Clipped, so that a single wild sample does not wake the robot.
-    clipped = np.clip(wheels.velocity_mps[:, :1], -_MAX_SAMPLE_MPS, _MAX_SAMPLE_MPS)
-    still = _is_steady(stamp, stamp, clipped, _MAX_WHEEL_MPS, _MAX_WHEEL_SPREAD_MPS)
-    quiet = max(_MIN_SPREAD_RADPS, 4 * imu.gyro_std_radps)
-    still &= _is_steady(stamp, imu.stamp_ns, imu.angular_velocity_radps, _MAX_BIAS_RADPS, quiet)
+    clipped = np.clip(wheels.velocity_mps[:, :1], -0.2, 0.2)
+    still = _is_steady(stamp, stamp, clipped, 0.02, 0.06)  # m/s: encoders at rest
+    quiet_radps = max(0.012, 4 * imu.gyro_std_radps)
+    still &= _is_steady(stamp, imu.stamp_ns, imu.angular_velocity_radps, 0.05, quiet_radps)  # a bias is less
     return _find_intervals(stamp, still)
 
 
@@ -240,5 +227,6 @@ def _find_intervals(stamp_ns: Ints, still: NDArray[np.bool_]) -> Ints:
     first = np.flatnonzero(still & ~np.concatenate(([False], joined)))
     last = np.flatnonzero(still & ~np.concatenate((joined, [False])))
     found = np.stack((stamp_ns[first], stamp_ns[last]), -1)
-    inner: Ints = found[found[:, 1] - found[:, 0] >= _MIN_LENGTH_NS] + np.array([_MARGIN_NS, -_MARGIN_NS])
+    # Shorter stops do not count; the robot rocks at both ends.
+    inner: Ints = found[found[:, 1] - found[:, 0] >= 600_000_000] + np.array([150_000_000, -150_000_000])
     return inner

@@ -31,18 +31,10 @@ from tcpipe.geometry.rotation import matrix_from_quat, multiply, normalize, quat
 
 _Number = TypeVar("_Number", np.float64, np.complex128)
 
-STEP_S, KNOT_S, _PITCH_KNOT_S = 0.05, 60.0, 240.0
-"""Steps of the grid of times; between knots of the drift of heading; of pitch, whose error is an accelerometer's bias [s]."""
-_UP_S, _ALIGN_S = 10.0, 10.0
-"""Time over which the specific force is averaged, and length of the windows of the alignment [s]."""
-_SLOWEST_IMU_NS = 100_000_000
-"""Longest period of an IMU that shows turns [ns]."""
+STEP_S, KNOT_S = 0.05, 60.0
+"""Steps of the grid of times, and between knots of the drift of heading [s]."""
 _ROUNDS, _FEWEST = 8, 4
 """Rounds of weighted least squares, and samples or windows that show a turn or a heading [1] (rulings)."""
-_ARM_STD_M, _OFFSET_STD_S, _PITCH_STD_RAD = 0.3, 0.3, 0.1
-"""Prior σ of what the alignment takes out: lever arm [m], time offset [s], pitch [rad]."""
-_MIN_SCALE, _MIN_MOVE_M = 0.2, 0.2
-"""Least scale of an odometry that shows the same motion [1], and least length of a window that shows a heading [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +57,7 @@ class Attitude:
 def find_turn_roles(measurements: Measurements) -> list[str]:
     """Return the sensors that show turns, the best first: IMU, camera, wheels."""
     imu = measurements.imu
-    usable = (
-        imu is not None and imu.stamp_ns.size >= _FEWEST and compute_median_period_ns(imu.stamp_ns) <= _SLOWEST_IMU_NS
-    )
+    usable = imu is not None and imu.stamp_ns.size >= _FEWEST and compute_median_period_ns(imu.stamp_ns) <= 100_000_000
     sources = [
         role
         for role, each in measurements.odometries().items()
@@ -148,7 +138,7 @@ def _multiply_increments(turn_rad: Floats) -> Floats:
 
 def _find_up(quat: Floats, force: Floats) -> Floats:
     """Return the direction of the averaged specific force in the drifting frame, (n, 3)."""
-    up = average_grid(np.einsum("nij,nj->ni", matrix_from_quat(quat), force), _UP_S)
+    up = average_grid(np.einsum("nij,nj->ni", matrix_from_quat(quat), force), 10.0)
     return np.asarray(up / np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9))
 
 
@@ -215,7 +205,7 @@ def align_tracks(
     return {
         role: alignment.make_track(forward_mps[role], replace(best, scale=fit.scale))
         for role, fit in fits.items()
-        if fit.scale > _MIN_SCALE
+        if fit.scale > 0.2  # else it shows another motion
     }
 
 
@@ -252,7 +242,7 @@ class _Alignment:
         self._attitude = attitude
         self._arm_m = attitude.rotation @ np.asarray(gnss.lever_arm_m)
         time_s, end_s = compute_seconds(gnss.stamp_ns, zero_ns), float(attitude.time_s[-1])
-        window_s = min(_ALIGN_S, 0.25 * end_s)
+        window_s = min(10.0, 0.25 * end_s)
         apart = max(1, round(0.2 * window_s * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
         first = np.arange(0, time_s.size, apart)
         last = np.minimum(np.searchsorted(time_s, time_s[first] + window_s), time_s.size - 1)
@@ -290,7 +280,7 @@ class _Alignment:
             velocity, arm = self._horizontal(forward, fit)
             moved = self._difference(integrate_grid(velocity) + arm)
             length = np.abs(moved)
-            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, _MIN_MOVE_M)
+            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, 0.2)
             if moving.sum() < _FEWEST:
                 return None
             unit = np.conj(moved) / np.maximum(length, 1e-9)
@@ -310,7 +300,8 @@ class _Alignment:
             columns = np.column_stack(
                 (length, 1j * length * turn, spin, 1j * spin, self._difference(velocity) * unit, 1j * length[:, None] * self._hats)
             )  # fmt: skip
-            prior = np.concatenate(([1.0, 0.5, _ARM_STD_M, _ARM_STD_M, _OFFSET_STD_S], np.ones(self._knots_s.size)))
+            # σ of scale and turn scale, lever arm [m], time offset [s] and headings [rad].
+            prior = np.concatenate(([1.0, 0.5, 0.3, 0.3, 0.3], np.ones(self._knots_s.size)))
             before = np.zeros(prior.size)
             before[2:5] = fit.arm_m.real, fit.arm_m.imag, fit.offset_s  # priors hold for these in all
             columns, off = columns * root[:, None], off * root
@@ -340,10 +331,11 @@ class _Alignment:
 
     def _fit_pitch(self, speed: Floats, climb: Floats) -> Floats:
         """Return the slow error of pitch [rad] on the grid (n,) with which the track climbs as the fixes do."""
-        knots_s = np.linspace(0.0, self._knots_s[-1], max(2, round(float(self._knots_s[-1]) / _PITCH_KNOT_S) + 1))
+        # An accelerometer's bias, 0.1 rad (1σ), is another one after 240 s.
+        knots_s = np.linspace(0.0, self._knots_s[-1], max(2, round(float(self._knots_s[-1]) / 240.0) + 1))
         hats = np.maximum(0.0, 1.0 - np.abs(self._middle_s[:, None] - knots_s) / knots_s[1])
         path = self._difference(integrate_grid(speed)).real
         rise = self._moved_m[:, 2] - self._difference(integrate_grid(climb) + self._arm_m[:, 2]).real
-        start, std = np.zeros(knots_s.size), np.full(knots_s.size, _PITCH_STD_RAD)
+        start, std = np.zeros(knots_s.size), np.full(knots_s.size, 0.1)
         pitch = solve_robust(hats * path[:, None], rise, start, std)
         return np.interp(self._attitude.time_s, knots_s, pitch)

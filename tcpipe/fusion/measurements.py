@@ -38,8 +38,6 @@ UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)
 """Of one whose place is not: it is on the robot."""
 
 
-_UNMEASURED_M2PS2 = 1e3
-"""A variance from which on an axis is not measured (ruling)."""
 UNMEASURED_RAD2 = 1e2
 """Variance of a rotation about an axis that is not measured."""
 
@@ -125,7 +123,7 @@ class BodyVelocities:
     @property
     def measured(self) -> NDArray[np.bool_]:
         """Axes along which most rows have a velocity, shape (3,)."""
-        is_measured: NDArray[np.bool_] = (self.variance_m2ps2 < _UNMEASURED_M2PS2).mean(0) > 0.5
+        is_measured: NDArray[np.bool_] = (self.variance_m2ps2 < 1e3).mean(0) > 0.5
         return is_measured
 
 

@@ -39,19 +39,12 @@ from tcpipe.fusion.signals import (
 )
 
 ALONG, ACROSS, UP = "along", "across", "up"
-TIMES_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
-"""Time differences."""
 FIX_S, SCALE_S = (1.0, 3.0, 10.0, 30.0, 100.0), (3.0, 10.0, 30.0, 100.0)
 """Correlation times of processes [s]: of fixes, of scales and directions."""
 MOVING_S = (1.0, 3.0)
 """The same of errors of fixes that are there only while the robot moves."""
 
-_NODES = 40  # of the path within a window
-_WINDOWS = 600  # of one length, at most
-_FEWEST = 8  # windows of one length
-_OVERLAPPING = 8  # windows begin in the length of one
-_LONGEST_GAP_NS = 300_000_000
-_STILL_MPS, _STILL_RAD, _STILL_S = 0.02, 0.02, 0.5  # the last: speeds are averaged, so that noise is none
+_STILL_MPS = 0.02
 _PAIR_STEP_S = 0.1  # between windows' ends of sensors that are no fixes
 
 
@@ -94,18 +87,19 @@ class _Section:
         """
         at_s = compute_seconds(at_ns, self.zero_ns)
         period_s = max(float(np.median(np.diff(at_s))), 1e-3) if at_s.size > 1 else np.inf
-        gaps_ns = [find_longest_step_ns(stamp_ns, _LONGEST_GAP_NS) for stamp_ns in sources]
-        for time_s in TIMES_S:
+        gaps_ns = [find_longest_step_ns(stamp_ns, 300_000_000) for stamp_ns in sources]
+        for time_s in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0):
             if time_s < 0.9 * period_s:
                 continue
-            first = np.arange(0, at_s.size, max(1, round(time_s / _OVERLAPPING / period_s), -(-at_s.size // _WINDOWS)))
+            # Eight begin in the length of one, and there are 600 of one length at most.
+            first = np.arange(0, at_s.size, max(1, round(time_s / 8 / period_s), -(-at_s.size // 600)))
             last = np.searchsorted(at_s, at_s[first] + time_s - 0.5 * period_s)
             first, last = first[last < at_s.size], last[last < at_s.size]
             length_s = at_s[last] - at_s[first]
             usable = np.abs(length_s - time_s) < max(0.05 * time_s, 0.6 * period_s)
             for stamp_ns, longest_ns in zip(sources, gaps_ns, strict=True):
                 usable &= ~is_in_gap(stamp_ns, at_ns[first], at_ns[last], longest_ns=longest_ns)
-            if usable.sum() >= _FEWEST:
+            if usable.sum() >= 8:
                 yield float(np.median(length_s[usable])), first[usable], last[usable]
 
 
@@ -124,7 +118,7 @@ def find_residuals(measurements: Measurements) -> list[Residuals]:
     residuals = list[Residuals]()
     forward = {role: compute_forward_mps(each, attitude, zero_ns) for role, each in odometries.items()}
     tracks = {} if gnss is None else align_tracks(forward, gnss, attitude, zero_ns)
-    speed = np.abs(average_grid(np.column_stack([*forward.values()]), _STILL_S)).max(axis=1)
+    speed = np.abs(average_grid(np.column_stack([*forward.values()]), 0.5)).max(axis=1)
     for role, track in tracks.items():
         residuals += _compare_fixes(section, gnss, role, track, speed) if gnss is not None else []
     if len(tracks) < len(forward):
@@ -211,7 +205,7 @@ def _compare_odometries(
 
 def _take_nodes(values: Floats, start_s: Floats, end_s: Floats) -> Floats:
     """Return what is on the grid in the middles of the parts of each window, (M, nodes)."""
-    nodes = max(2, min(_NODES, round(float(np.median(end_s - start_s)) / STEP_S)))
+    nodes = max(2, min(40, round(float(np.median(end_s - start_s)) / STEP_S)))
     part = (np.arange(nodes) + 0.5) / nodes
     rows = np.rint((start_s[:, None] + (end_s - start_s)[:, None] * part) / STEP_S).astype(np.int64)
     return np.asarray(values[rows.clip(0, values.size - 1)])
@@ -244,7 +238,7 @@ class _Window:
         """Return whether the robot neither moves nor turns in each window."""
         turned = np.ptp(_take_nodes(self._yaw, *self._span), axis=1)
         return np.asarray(
-            (_take_nodes(speed_mps, *self._span) < _STILL_MPS).all(1) & (turned < _STILL_RAD + 0.01 * self.time_s)
+            (_take_nodes(speed_mps, *self._span) < _STILL_MPS).all(1) & (turned < 0.02 + 0.01 * self.time_s)
         )
 
     def describe(self, role: str, axis: str, *, has_others: bool) -> dict[str, Floats]:

@@ -14,10 +14,11 @@ import numpy as np
 from tcpipe.arrays import Floats
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel, Prior
-from tcpipe.fusion.filter_kernel import MOTION_WITH_GYRO, MOTION_WITHOUT_GYRO, FilterModel, Memory
+from tcpipe.fusion.filter_kernel import FilterModel, Memory
 from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements, Positions
 from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, is_length_observable, turn_scale_std
 from tcpipe.fusion.signals import find_chi_square_threshold
+from tcpipe.fusion.state import Error, Kind, Mode
 from tcpipe.fusion.ticks import Ticks
 from tcpipe.geometry.rotation import matrix_from_quat
 
@@ -39,30 +40,32 @@ class Parameter:
 
 
 PARAMETERS = (
-    Parameter("gyroscope bias", state.GYRO_BIAS, 3, 0.02, 0.0, "rad/s", "MEMS: 1°/s at turn-on; walk: `densities`"),
-    Parameter("accelerometer bias", state.ACCELEROMETER_BIAS, 3, 0.15, 3e-4, "m/s²", "MEMS: 15 mg, 1 mg in a run"),
-    Parameter("antenna", state.ARM, 3, 0.0, 0.0, "m", "stated or not: `Positions.lever_arm_std_m`"),
-    Parameter("lag of fixes", state.FIX_LAG, 1, 0.0, 1e-3, "s", "`Positions.lag_std_s`"),
-    Parameter("wheel scale", state.WHEEL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
-    Parameter("camera scale", state.VISUAL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
-    Parameter("turn scale", state.TURN_SCALE, 1, 0.0, 0.0, "1", "`process.turn_scale_std`"),
+    Parameter("gyroscope bias", Error.GYRO_BIAS, 3, 0.02, 0.0, "rad/s", "MEMS: 1°/s at turn-on; walk: `densities`"),
+    Parameter("accelerometer bias", Error.ACCELEROMETER_BIAS, 3, 0.15, 3e-4, "m/s²", "MEMS: 15 mg, 1 mg in a run"),
+    Parameter("antenna", Error.ARM, 3, 0.0, 0.0, "m", "stated or not: `Positions.lever_arm_std_m`"),
+    Parameter("lag of fixes", Error.FIX_LAG, 1, 0.0, 1e-3, "s", "`Positions.lag_std_s`"),
+    Parameter("wheel scale", Error.WHEEL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
+    Parameter("camera scale", Error.VISUAL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
+    Parameter("turn scale", Error.TURN_SCALE, 1, 0.0, 0.0, "1", "`process.turn_scale_std`"),
     Parameter(
-        "turning centre", state.TURNING_CENTRE, 1, 0.05, 0.0, "m", "skid-steered robots turn ahead of their middle"
+        "turning centre", Error.TURNING_CENTRE, 1, 0.05, 0.0, "m", "skid-steered robots turn ahead of their middle"
     ),
-    Parameter("mounting of the IMU", state.MOUNT, 3, 0.0175, 0.0, "rad", "stated to a degree"),
-    Parameter("mounting of the camera", state.VISUAL_MOUNT, 2, 0.0175, 0.0, "rad", "stated to a degree"),
-    Parameter("lag of wheels", state.WHEEL_LAG, 1, 0.02, 1e-3, "s", "drivers stamp on arrival"),
-    Parameter("lag of camera", state.VISUAL_LAG, 1, 0.03, 1e-3, "s", "exposure and processing"),
-    Parameter("mounting of the pose", state.POSE_MOUNT, 3, 0.0, 0.0, "rad", "`Positions.mounting_std_rad`"),
-    Parameter("frame of the pose", state.POSE_FRAME, 3, 0.05, 2e-3, "rad", "level to 3°; drifts by 1° a minute"),
+    Parameter("mounting of the IMU", Error.MOUNT, 3, 0.0175, 0.0, "rad", "stated to a degree"),
+    Parameter("mounting of the camera", Error.VISUAL_MOUNT, 2, 0.0175, 0.0, "rad", "stated to a degree"),
+    Parameter("lag of wheels", Error.WHEEL_LAG, 1, 0.02, 1e-3, "s", "drivers stamp on arrival"),
+    Parameter("lag of camera", Error.VISUAL_LAG, 1, 0.03, 1e-3, "s", "exposure and processing"),
+    Parameter("mounting of the pose", Error.POSE_MOUNT, 3, 0.0, 0.0, "rad", "`Positions.mounting_std_rad`"),
+    Parameter("frame of the pose", Error.POSE_FRAME, 3, 0.05, 2e-3, "rad", "level to 3°; drifts by 1° a minute"),
 )
 """What does not come from the run itself; the scales of odometries and the errors of fixes do, see `make_priors`."""
 FIX_AXES = np.array([1.0, 1.0, 1.7])
 """Ratio of lasting errors of fixes east, north and up [1]: no satellite is below."""
-_PATIENCE = {state.FIX: (5.0, 15.0, 5.0), state.WHEELS: (5.0, 5.0, 0.3), state.VISUAL: (5.0, 5.0, 0.3)}
-_NEVER = (1e18, 1e18, 1e18)
+_PATIENCE: Mapping[int, tuple[float, float, float]] = {
+    Kind.FIX: (5.0, 15.0, 5.0),
+    Kind.WHEELS: (5.0, 5.0, 0.3),
+    Kind.VISUAL: (5.0, 5.0, 0.3),
+}
 _MINUTE_S = 60.0
-_MEAN_LASTS_S = 100.0  # the mean of a varying scale strays by as much as the scale varies
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +83,7 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     """Return standard deviation, walk and correlation time of every error, shapes (45,): 0 where it is exact, or nothing depends on it."""
     std, walk = np.zeros(state.N), np.zeros(state.N)
     has_imu = m.imu is not None
-    inertial = bool((ticks.inputs.mode == state.INERTIAL).any())
+    inertial = bool((ticks.inputs.mode == Mode.INERTIAL).any())
     wanted = {
         "gyroscope bias": has_imu,
         "accelerometer bias": inertial,
@@ -97,24 +100,25 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
             rows = slice(parameter.place, parameter.place + parameter.count)
             std[rows], walk[rows] = parameter.std, parameter.walk
     if m.imu is not None:
-        walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = find_walk(noise.turns[IMU].correlated)
+        walk[Error.GYRO_BIAS : Error.GYRO_BIAS + 3] = find_walk(noise.turns[IMU].correlated)
     scales = find_scale_stds(m, noise.horizontal)
-    for role, place in ((WHEELS, state.WHEEL_SCALE), (VISUAL, state.VISUAL_SCALE)):
+    for role, place in ((WHEELS, Error.WHEEL_SCALE), (VISUAL, Error.VISUAL_SCALE)):
         if role in m.odometries() and scales[role]:
-            std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].correlated.variance / _MEAN_LASTS_S)
+            # In 100 s the mean of a varying scale strays by as much as the scale varies.
+            std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].correlated.variance / 100.0)
     time_s = np.full(state.N, np.inf)
-    for place, process in _list_varying_scales(m, noise).items():
-        std[place], time_s[place] = np.sqrt(process.variance), process.time_s
-    std[state.TURN_SCALE] = turn_scale_std(m)
+    for error, process in _list_varying_scales(m, noise).items():
+        std[error], time_s[error] = np.sqrt(process.variance), process.time_s
+    std[Error.TURN_SCALE] = turn_scale_std(m)
     # Wheels skid otherwise in each turn.
-    walk[state.TURN_SCALE] = 0.0 if has_imu else np.sqrt(2.0 / _MINUTE_S) * std[state.TURN_SCALE]
+    walk[Error.TURN_SCALE] = 0.0 if has_imu else np.sqrt(2.0 / _MINUTE_S) * std[Error.TURN_SCALE]
     if m.gnss is not None:
         if wanted["lag of fixes"]:
-            std[state.FIX_LAG] = m.gnss.lag_std_s
-        std[state.ARM : state.FIX_LAG] = m.gnss.lever_arm_std_m if m.has_tilt else 0.0
-        std[state.FIX_OFFSET : state.FIX_OFFSET + 3] = _find_lasting_std_m(m.gnss, m, noise)
-        std[state.POSE_MOUNT : state.POSE_MOUNT + 3] = m.gnss.mounting_std_rad if m.has_attitude else 0.0
-        std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
+            std[Error.FIX_LAG] = m.gnss.lag_std_s
+        std[Error.ARM : Error.FIX_LAG] = m.gnss.lever_arm_std_m if m.has_tilt else 0.0
+        std[Error.FIX_OFFSET : Error.FIX_OFFSET + 3] = _find_lasting_std_m(m.gnss, m, noise)
+        std[Error.POSE_MOUNT : Error.POSE_MOUNT + 3] = m.gnss.mounting_std_rad if m.has_attitude else 0.0
+        std[Error.FIX_ERROR : Error.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
     return std, walk, time_s
 
 
@@ -141,40 +145,39 @@ def _list_varying_scales(m: Measurements, noise: NoiseModel) -> dict[int, GaussM
     """Return how scales of odometries vary around their means, by error; only fixes show it."""
     if not is_length_observable(m, noise.horizontal):
         return {}
-    places = {WHEELS: state.WHEEL_SLIP, VISUAL: state.VISUAL_SLIP}
-    found = {places[role]: noise.odometries[role].correlated for role in m.odometries()}
-    return found | ({state.SHARED_SCALE: noise.shared_scale} if found else {})
+    places = {WHEELS: Error.WHEEL_SLIP, VISUAL: Error.VISUAL_SLIP}
+    found: dict[int, GaussMarkov] = {places[role]: noise.odometries[role].correlated for role in m.odometries()}
+    return found | ({Error.SHARED_SCALE: noise.shared_scale} if found else {})
 
 
-_MOTION = (*range(state.THETA, state.GYRO_BIAS),)
-_BODY = (*range(state.U, state.GYRO_BIAS + 3), *range(state.MOUNT, state.MOUNT + 3))
-_ANTENNA = (*range(state.THETA, state.THETA + 3), *_BODY, *range(state.ARM, state.FIX_LAG + 1))
+_BODY = (*range(Error.U, Error.GYRO_BIAS + 3), *range(Error.MOUNT, Error.MOUNT + 3))
+_ANTENNA = (*range(Error.THETA, Error.THETA + 3), *_BODY, *range(Error.ARM, Error.FIX_LAG + 1))
 _DEPENDS: Mapping[int, Sequence[int]] = {
-    state.WHEELS: (*_BODY, state.WHEEL_SCALE, state.WHEEL_SLIP, state.SHARED_SCALE, state.WHEEL_LAG),
-    state.SIDEWAYS: (*_BODY, state.TURNING_CENTRE),
-    state.VISUAL: (
+    Kind.WHEELS: (*_BODY, Error.WHEEL_SCALE, Error.WHEEL_SLIP, Error.SHARED_SCALE, Error.WHEEL_LAG),
+    Kind.SIDEWAYS: (*_BODY, Error.TURNING_CENTRE),
+    Kind.VISUAL: (
         *_BODY,
-        state.VISUAL_SCALE,
-        state.VISUAL_SLIP,
-        state.SHARED_SCALE,
-        state.VISUAL_MOUNT,
-        state.VISUAL_MOUNT + 1,
-        state.VISUAL_LAG,
+        Error.VISUAL_SCALE,
+        Error.VISUAL_SLIP,
+        Error.SHARED_SCALE,
+        Error.VISUAL_MOUNT,
+        Error.VISUAL_MOUNT + 1,
+        Error.VISUAL_LAG,
     ),
-    state.STATIONARY: range(state.U, state.U + 3),
-    state.STATIONARY_RATE: range(state.GYRO_BIAS, state.GYRO_BIAS + 3),
-    state.LEVEL: range(3),
-    state.DOPPLER: _ANTENNA,
-    state.FIX: (*_ANTENNA, *range(state.RHO, state.RHO + 3), *range(state.FIX_ERROR, state.FIX_OFFSET + 3)),
-    state.ATTITUDE: (
-        *range(state.THETA, state.THETA + 3),
-        *range(state.GYRO_BIAS, state.GYRO_BIAS + 3),
-        state.FIX_LAG,
-        *range(state.MOUNT, state.MOUNT + 3),
-        *range(state.POSE_MOUNT, state.POSE_FRAME + 3),
+    Kind.STATIONARY: range(Error.U, Error.U + 3),
+    Kind.STATIONARY_RATE: range(Error.GYRO_BIAS, Error.GYRO_BIAS + 3),
+    Kind.LEVEL: range(3),
+    Kind.DOPPLER: _ANTENNA,
+    Kind.FIX: (*_ANTENNA, *range(Error.RHO, Error.RHO + 3), *range(Error.FIX_ERROR, Error.FIX_OFFSET + 3)),
+    Kind.ATTITUDE: (
+        *range(Error.THETA, Error.THETA + 3),
+        *range(Error.GYRO_BIAS, Error.GYRO_BIAS + 3),
+        Error.FIX_LAG,
+        *range(Error.MOUNT, Error.MOUNT + 3),
+        *range(Error.POSE_MOUNT, Error.POSE_FRAME + 3),
     ),
-    MOTION_WITHOUT_GYRO: (*_MOTION, state.TURN_SCALE),
-    MOTION_WITH_GYRO: (*range(state.MOVING), state.TURN_SCALE),
+    state.KINDS: (*range(Error.GYRO_BIAS), Error.TURN_SCALE),
+    state.KINDS + 1: (*range(state.MOVING), Error.TURN_SCALE),
 }
 """Errors on which each kind of measurement depends, and motion by odometry and by gyroscope."""
 
@@ -197,7 +200,7 @@ def make_model(
     """
     kept = np.ones(state.N) if time_s is None else np.exp(-period_s / time_s)
     involved = {event.place for event in events} | set(possible)
-    active = np.array([e for e in range(state.N) if e < state.GYRO_BIAS or std[e] or walk[e] or e in involved])
+    active = np.array([e for e in range(state.N) if e < Error.GYRO_BIAS or std[e] or walk[e] or e in involved])
     position = {int(e): i for i, e in enumerate(active)}
     depends = np.zeros((state.KINDS + 2, active.size), np.int64)
     counts = np.zeros(state.KINDS + 2, np.int64)
@@ -206,11 +209,11 @@ def make_model(
         counts[row] = len(places)
         depends[row, : len(places)] = places
     gates = np.full(state.KINDS, np.inf)
-    for kind in set(range(state.KINDS)) - {state.SIDEWAYS, state.LEVEL}:
+    for kind in set(range(state.KINDS)) - {Kind.SIDEWAYS, Kind.LEVEL}:
         gates[kind] = find_chi_square_threshold(state.SIZES[kind], gate_probability)
     scales = np.full(state.KINDS, -1, np.int64)
-    scales[state.WHEELS] = position.get(state.WHEEL_SCALE, -1)
-    scales[state.VISUAL] = position.get(state.VISUAL_SCALE, -1)
+    scales[Kind.WHEELS] = position.get(Error.WHEEL_SCALE, -1)
+    scales[Kind.VISUAL] = position.get(Error.VISUAL_SCALE, -1)
     return FilterModel(
         active=active,
         depends=depends,
@@ -219,7 +222,7 @@ def make_model(
         noise=np.square(walk[active]) * period_s + np.square(std[active]) * (1.0 - kept[active] ** 2),
         gates=gates,
         patience=_find_patience(m, follows=follows),
-        mount=position.get(state.MOUNT, -1),
+        mount=position.get(Error.MOUNT, -1),
         scales=scales,
         events=np.array([(e.tick, position[e.place], e.is_new) for e in events], np.int64).reshape(-1, 3),
         sizes=np.array([(std[e.place] if e.is_new else e.std) ** 2 for e in events], np.float64),
@@ -228,14 +231,14 @@ def make_model(
 
 
 def _find_patience(m: Measurements, *, follows: bool) -> Floats:
-    patience = np.array([_PATIENCE.get(kind, _NEVER) for kind in range(state.KINDS)])
+    patience = np.array([_PATIENCE.get(kind, (np.inf,) * 3) for kind in range(state.KINDS)])
     if m.visual is None or m.imu is None:  # what is left cannot overrule fixes for long
-        patience[state.FIX, 1] = _PATIENCE[state.FIX][2]
+        patience[Kind.FIX, 1] = _PATIENCE[Kind.FIX][2]
     if m.imu is None and m.visual is None:  # wheels that dig in must not overrule fixes
-        patience[state.FIX, 1:] = 1.0
+        patience[Kind.FIX, 1:] = 1.0
     if not follows:
-        patience[state.FIX] = _NEVER
-    patience[state.ATTITUDE] = patience[state.FIX]
+        patience[Kind.FIX] = np.inf
+    patience[Kind.ATTITUDE] = patience[Kind.FIX]
     return patience
 
 
@@ -245,13 +248,13 @@ def make_start(initial: InitialState, std: Floats, arm_m: Sequence[float]) -> Me
     rotation = matrix_from_quat(initial.quat_xyzw)
     x[:9] = rotation.ravel()
     x[9:12] = initial.position_enu_m
-    x[state.U + 6 : state.U + 9] = rotation.T @ initial.velocity_enu_mps
+    x[Error.U + 6 : Error.U + 9] = rotation.T @ initial.velocity_enu_mps
     np.fill_diagonal(P, std**2)
-    if std[state.GYRO_BIAS]:
-        x[state.GYRO_BIAS + 6 : state.GYRO_BIAS + 9] = initial.gyro_bias_radps
-        bias = range(state.GYRO_BIAS, state.GYRO_BIAS + 3)
+    if std[Error.GYRO_BIAS]:
+        x[Error.GYRO_BIAS + 6 : Error.GYRO_BIAS + 9] = initial.gyro_bias_radps
+        bias = range(Error.GYRO_BIAS, Error.GYRO_BIAS + 3)
         P[bias, bias] = initial.gyro_bias_std_radps**2
-    x[state.ARM + 6 : state.ARM + 9] = arm_m
+    x[Error.ARM + 6 : Error.ARM + 9] = arm_m
     level = np.diag(np.square([initial.tilt_std_rad, initial.tilt_std_rad, initial.yaw_std_rad]))
     P[0:3, 0:3] = rotation.T @ level @ rotation
     P[3:6, 3:6] = rotation.T @ np.diag(np.square(initial.position_std_m)) @ rotation
@@ -259,15 +262,12 @@ def make_start(initial: InitialState, std: Floats, arm_m: Sequence[float]) -> Me
     return Memory(x, P, np.zeros((state.KINDS, 2)))
 
 
-_START_STDS = 5.0
-"""Error of the start position, which comes from the first fixes, in standard deviations of a constant error of fixes."""
-
-
 def widen_start(start: Memory, std: Floats) -> Memory:
     """Return the start of all errors with the standard deviations ``std``, shape (45,), of the errors of fixes."""
     widened = start.copy()
-    for place in range(state.FIX_ERROR, state.FIX_OFFSET + 3):
+    for place in range(Error.FIX_ERROR, Error.FIX_OFFSET + 3):
         widened.P[place, place] = std[place] ** 2
-    offset_m2 = np.square(_START_STDS * std[state.FIX_OFFSET : state.FIX_OFFSET + 3])
-    widened.P[range(state.RHO, state.RHO + 3), range(state.RHO, state.RHO + 3)] += offset_m2
+    # The start position comes from the first fixes: 5σ of their constant error.
+    offset_m2 = np.square(5.0 * std[Error.FIX_OFFSET : Error.FIX_OFFSET + 3])
+    widened.P[range(Error.RHO, Error.RHO + 3), range(Error.RHO, Error.RHO + 3)] += offset_m2
     return widened

@@ -45,23 +45,11 @@ _IMU = Subject("role", IMU)
 _QUAT = ("quat_x", "quat_y", "quat_z", "quat_w")
 _VELOCITY_FLOOR_MPS = 0.02  # no odometry is better
 _MAX_VELOCITY_MPS = 50.0  # no robot is faster
-_MAX_RATE_RADPS = 100.0  # no gyroscope measures more
-_MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
 GRAVITY_BAND_MPS2 = (8.0, 12.0)
 """Median size of a specific force that contains gravity [m/s²]."""
-_FROZEN_NS = 1_000_000_000  # fixes that repeat for less, or for two of their periods, are those of a slow receiver
-_DATUM_FIXES = 10  # the ENU origin is their median
-_NOISE_WINDOW_NS = 2_000_000_000  # window of noise around each sample
-_MIN_COSINE = 0.1  # cosine: an unmeasured axis affects another, 6°
-_DEGREE_M = 111_320.0  # one degree of latitude, or of longitude at the equator [m]
 _SLICE_ROWS = 1 << 16
 _FEWEST = 20  # samples that show a grid or a turn
-_MIN_MOVING_MPS = 0.2  # a slower robot may be stationary, and its increments have no direction
-_JITTER_S = 0.05  # less does not matter
-_MIN_LATE_S, _MIN_SLOPE_S = 0.2, 1.0
-"""Delay of a receiver from which on it is taken to filter its positions, and shortest window that shows an acceleration [s]."""
-_JITTER_STEPS, _JITTER_STEP_S, _JITTER_MPS = 41, 2.0, 0.3
-"""Pairs of fixes in a window of the estimate of jitter [1], longest time between two fixes [s], and slowest motion [m/s]."""
+_JITTER_STEPS = 41  # pairs of fixes in a window of the estimate of jitter
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +73,7 @@ class Repeats:
 
 def find_datum(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> tuple[float, float, float] | None:
     """Return longitude [deg], latitude [deg], height [m]: the median of the first ten fixes; None where there is none."""
-    usable = np.flatnonzero(_is_fix(lon_deg, lat_deg, alt_m))[:_DATUM_FIXES]
+    usable = np.flatnonzero(_is_fix(lon_deg, lat_deg, alt_m))[:10]
     if usable.size == 0:
         return None
     first = lon_deg[usable[0]]
@@ -121,7 +109,7 @@ def prepare_positions(
     default = np.square(default_std_m * np.array([1.0, 1.0, 2.0]))
     unclaimed = np.asarray(~_is_known(variance[:, :2]).all(1))
     variance, replaced = _clean_variances(variance, default, floor_std_m**2)
-    degree_m = _DEGREE_M * np.array([np.cos(np.radians(datum_deg_m[1])), 1.0])
+    degree_m = 111_320.0 * np.array([np.cos(np.radians(datum_deg_m[1])), 1.0])  # of longitude, and of latitude
     rounding = _compute_rounding_variances(np.column_stack((lon, lat))[usable]) * degree_m**2
     unclaimed |= (rounding > variance[:, :2]).any(1)  # the receiver does not know how its coordinates are written
     variance[:, :2] += rounding
@@ -163,14 +151,14 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
         return gnss, ()
     last = np.append(first[1:], stamp_ns.size) - 1
     kept_ns = stamp_ns[last] - stamp_ns[first]
-    lasting = kept_ns >= max(_FROZEN_NS, 2 * compute_median_period_ns(stamp_ns[first]))
+    lasting = kept_ns >= max(1_000_000_000, 2 * compute_median_period_ns(stamp_ns[first]))
     if odometry is None:
         kept = changes | np.repeat(lasting, last - first + 1)
         return (gnss if kept.all() else select_sensor_rows(gnss, kept)), ()
     zero = int(stamp_ns[0])
     speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
     driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
-    frozen = np.flatnonzero(lasting & (driven_m[last] - driven_m[first] > _MIN_MOVING_MPS * kept_ns * 1e-9))
+    frozen = np.flatnonzero(lasting & (driven_m[last] - driven_m[first] > 0.2 * kept_ns * 1e-9))  # faster than 0.2 m/s
     found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
     return select_sensor_rows(gnss, changes), tuple(found)
 
@@ -189,7 +177,7 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
     driven_m = np.diff(integrate_signal(odometry_s, speed, stamp_s), axis=0)[:, 0]
     interval_s = np.diff(stamp_s)
     moved_m = np.hypot(*np.diff(gnss.position_enu_m[:, :2], axis=0).T)
-    moving = (driven_m > _JITTER_MPS * interval_s) & (interval_s < _JITTER_STEP_S)
+    moving = (driven_m > 0.3 * interval_s) & (interval_s < 2.0)  # faster than 0.3 m/s, without a gap
     if moving.sum() < _JITTER_STEPS:
         return gnss, np.zeros(stamp_s.size)
     driven_m, moved_m, mean_speed = driven_m[moving], moved_m[moving], driven_m[moving] / interval_s[moving]
@@ -200,7 +188,7 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
     # One outlying fix spoils two pairs: the fourth fifth bears one in ten, yet sees tails that the median does not.
     spread_s = np.quantile(_make_windows(np.abs(residual_s)), 0.8, axis=1) / 1.2816
     excess_s2 = spread_s**2 / 2 - claimed_s2
-    matters = excess_s2 > np.maximum(_JITTER_S**2, 4 * claimed_s2)
+    matters = excess_s2 > np.maximum(0.05**2, 4 * claimed_s2)
     middle_s = (0.5 * (stamp_s[1:] + stamp_s[:-1]))[moving]
     jitter_s = np.interp(stamp_s, middle_s, np.sqrt(np.where(matters, excess_s2, 0.0)))
     variance = gnss.variance_m2.copy()
@@ -215,11 +203,11 @@ def inflate_late_fixes(gnss: Positions, late_s: float) -> Positions:
     A first-order low-pass of time τ delays positions by τ; once that is corrected, they are off by τ² times the acceleration. Correlation
     with speeds shows a delay below τ, so that the rest may be as long as the delay.
     """
-    if late_s < _MIN_LATE_S:
+    if late_s < 0.2:
         return gnss
     axes = list(gnss.position_enu_m[:, :2].T)
     for _ in range(2):
-        axes = [compute_slopes(gnss.stamp_ns, axis, max(2.0 * late_s, _MIN_SLOPE_S)) for axis in axes]
+        axes = [compute_slopes(gnss.stamp_ns, axis, max(2.0 * late_s, 1.0)) for axis in axes]
     variance = gnss.variance_m2.copy()
     variance[:, :2] += ((late_s**2 * np.hypot(*axes)) ** 2)[:, None]
     return replace(gnss, variance_m2=variance, unclaimed=np.ones(len(variance), np.bool_), lag_std_s=late_s)
@@ -306,7 +294,7 @@ def _rotate_vectors(matrix: Floats, values: Floats) -> Floats:
     """Return ``matrix`` (3, 3) times vectors (N, 3); NaN, what is not measured, makes each axis NaN into which it turns."""
     unknown = np.isnan(values)
     turned = np.where(unknown, 0.0, values) @ matrix.T
-    return np.where(unknown @ (np.abs(matrix).T > _MIN_COSINE), np.nan, turned)
+    return np.where(unknown @ (np.abs(matrix).T > 0.1), np.nan, turned)
 
 
 def prepare_imu(
@@ -328,8 +316,8 @@ def prepare_imu(
     if is_alive and (np.nan_to_num(rate) == 0.0).all(0).any():
         quat = normalize(_stack_columns(columns, _QUAT))
         rate, of_orientation = compute_orientation_rates(stamp_ns, rate, quat)
-    # NaN compares false.
-    good: Mask = np.all(np.abs(rate) < _MAX_RATE_RADPS, 1) & np.all(np.abs(force) < _MAX_FORCE_MPS2, 1)
+    # No gyroscope measures 100 rad/s, no accelerometer 1,000 m/s²; NaN compares false.
+    good: Mask = np.all(np.abs(rate) < 100.0, 1) & np.all(np.abs(force) < 1000.0, 1)
     usable, repeated = _select_usable_rows(stamp_ns, good)
     if usable.size < stamp_ns.size:
         rate, force = rate[usable], force[usable]
@@ -390,7 +378,7 @@ def _estimate_local_noise(stamp_ns: Ints, values: Floats) -> Floats:
     largest = np.zeros(stamp_ns.size)
     for axis in values.T if stamp_ns.size > 2 else ():
         square = np.square(np.diff(axis, n=2))[:, None] / 6.0
-        np.fmax(largest, compute_window_means(stamp_ns[1:-1], square, stamp_ns, _NOISE_WINDOW_NS)[:, 0], out=largest)
+        np.fmax(largest, compute_window_means(stamp_ns[1:-1], square, stamp_ns, 2_000_000_000)[:, 0], out=largest)
     return np.sqrt(largest)
 
 
@@ -421,14 +409,12 @@ def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[F
 
 
 _MAX_INCREMENT_S = 1.0  # longer increments give no velocity
-_MIN_MOVED_M = 0.1  # smaller moves may be stationary
-_MIN_TURNED_RAD = 0.2  # a larger turn contradicts a zero rate
 
 
 def has_twist(velocity_mps: Floats, pose_m: Floats) -> bool:
     """Return whether the velocities are measurements: finite somewhere, and not zero throughout while the poses move."""
     posed = pose_m[np.isfinite(pose_m).all(1)]
-    moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > _MIN_MOVED_M
+    moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > 0.1  # m: less may be noise
     return bool(np.isfinite(velocity_mps).any() and (np.nan_to_num(velocity_mps).any() or not moves))
 
 
@@ -460,7 +446,7 @@ def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Flo
         return rate_radps, np.zeros(3, np.bool_)
     stamp, quat = stamp_ns[known], quat_xyzw[known]
     turned_rad = np.cumsum(compute_turns(quat), axis=0)
-    turns = zero & (np.ptp(turned_rad, axis=0) > _MIN_TURNED_RAD)
+    turns = zero & (np.ptp(turned_rad, axis=0) > 0.2)
     # Over two steps, so that the rate is that in the middle, at the stamp itself.
     step_s = (stamp[2:] - stamp[:-2])[:, None] * 1e-9
     rate = compute_turns(quat, 2) / step_s

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints
-from tcpipe.fusion import state
 from tcpipe.fusion.densities import PRIORS, NoiseModel, SensorNoise
 from tcpipe.fusion.measurements import (
     IMU,
@@ -31,6 +30,7 @@ from tcpipe.fusion.signals import (
     is_covered,
     remove_wild_places,
 )
+from tcpipe.fusion.state import Mode
 from tcpipe.robust import estimate_robust_std
 
 SCALE_STD: Mapping[str, float] = {
@@ -45,21 +45,11 @@ _TURN_SCALE_STD: Mapping[str, float] = {
 }
 """σ of the scale of a turn rate [1]."""
 SLOPE_RAD = 0.1  # slope of unknown ground [rad], 1σ
-DOPPLER_LASTS_S = 3.0  # weight of a correlation that fades in 1.5 s [s]
 UNSEEN_TURN_RADPS = 0.07  # roll and pitch rate on uneven ground [rad/s], 1σ
 GROUND = 2e-3  # density of the change of slope under a robot [rad²/m]: 2.6° over a metre
-_ACCELERATION_WINDOW_S = 0.6  # window of an odometry's slope [s]
 _ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration [s]: one row
-_COURSE_DENSITY = 5e-3  # density of turns that only the course over ground shows [rad²/s]: 4° in a second
-_MIN_TURN_DENSITY = 5e-7  # least density of turns [rad²/s]: a tenth of a degree in a second
 _MIN_DENSITY = 1e-4  # least density of velocity [m²/s³]: 1 cm/s in a second, forward and aside
-_SLIDE_DENSITY = 4e-4  # density of sliding that no camera shows [m²/s³]
 _UNKNOWN_DENSITY = 0.3  # density of velocity that no sensor shows [m²/s³]
-_FIXES, _WINDOW_S = 5, 1.0  # fewest fixes [1], and shortest time [s], that show a velocity or a slide
-_UNSEEN_LASTS_S = 0.2  # correlation time of an acceleration that a fast receiver shows [s]
-_UNSEEN_MPS2 = 0.07  # acceleration between two measurements of a receiver [m/s²], 1σ
-_UNSEEN_MPS = 0.5  # σ of a velocity by fixes above which they do not show its change [m/s]
-_SHOWN_MPS2 = 0.15  # σ of an acceleration by a receiver [m/s²]: half of the change that masks look for
 
 
 def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
@@ -121,12 +111,12 @@ def make_motion_noise(  # noqa: PLR0917
     ``mode`` and ``rate_radps`` are those of the tick, as `tcpipe.fusion.state.move_state` takes them.
     """
     density = np.zeros((stamp_ns.size, 6))
-    by_gyro = mode >= state.GYRO_TURN
+    by_gyro = mode >= Mode.GYRO_TURN
     if m.imu is not None:
         density[by_gyro, :3] = noise.turns[IMU].white
     metres_per_s = _compute_speed(m, stamp_ns[~by_gyro])
     density[~by_gyro, :3] = _make_turn_density(m, noise, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
-    inertial = mode == state.INERTIAL
+    inertial = mode == Mode.INERTIAL
     if m.imu is not None and inertial.any():
         density[inertial, 3:] = _compute_accelerometer_density(m.imu, stamp_ns[inertial])[:, None]
     if not inertial.all():
@@ -151,12 +141,12 @@ def _make_turn_density(
 
     The scale of an odometry's turn rate is off by the variation of `PRIORS` for a second at a time, beside what is constant of it.
     """
-    density = np.full((mode.size, 3), _MIN_TURN_DENSITY)
+    density = np.full((mode.size, 3), 5e-7)  # at least a tenth of a degree in a second
     ground = np.full(mode.size, 0.0 if m.is_antenna_alone else GROUND)
     if is_turned_by_course(m):
-        density[:, 2] = _COURSE_DENSITY
+        density[:, 2] = 5e-3  # 4° in a second
     for role in noise.turns.keys() - {IMU}:
-        rows = mode == (state.VISUAL_TURN if role == VISUAL else state.FLAT_TURN)
+        rows = mode == (Mode.VISUAL_TURN if role == VISUAL else Mode.FLAT_TURN)
         is_spatial = m.odometries()[role].turn_rate_radps is not None
         density[rows, 0 if is_spatial else 2 :] = noise.turns[role].white
         ground[rows] *= not is_spatial
@@ -180,7 +170,7 @@ def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:
     found = np.full(at_ns.size, np.nan)
     for source in sources:
         covered = is_covered(source.stamp_ns, at_ns, at_ns)
-        slope = compute_slopes(source.stamp_ns, source.velocity_mps[:, 0], _ACCELERATION_WINDOW_S)
+        slope = compute_slopes(source.stamp_ns, source.velocity_mps[:, 0], 0.6)
         found[covered] = np.fmin(found[covered], np.interp(at_ns[covered], source.stamp_ns, np.abs(slope)))
     unseen = np.full(at_ns.size, _UNKNOWN_DENSITY) if sources else _compute_receiver_density(m, at_ns)
     return np.where(np.isnan(found), unseen, _MIN_DENSITY + _ACCELERATION_LASTS_S * found**2)
@@ -192,30 +182,32 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     An acceleration between slow fixes lasts from one to the next. Fixes too noisy to show a velocity do not show how steady it is.
     """
     source, least = m.doppler or m.gnss, 0.0
-    if source is None or source.stamp_ns.size < _FIXES:
+    if source is None or source.stamp_ns.size < 5:
         return np.full(at_ns.size, _UNKNOWN_DENSITY)
     period_s = 1e-9 * compute_median_period_ns(source.stamp_ns)
     if isinstance(source, Positions):
         std, order = float(np.sqrt(np.median(source.variance_m2[:, :2]))), 2
-        velocity_std_mps = np.sqrt(12.0 / _FIXES) * std / max(_WINDOW_S, _FIXES * period_s)
-        least = _UNKNOWN_DENSITY * min(1.0, (velocity_std_mps / _UNSEEN_MPS) ** 2)
+        velocity_std_mps = np.sqrt(12.0 / 5.0) * std / max(1.0, 5.0 * period_s)  # five fixes, for a second at least
+        least = _UNKNOWN_DENSITY * min(1.0, (velocity_std_mps / 0.5) ** 2)
         places = remove_wild_places(source.position_enu_m)
         axes = [places.real, places.imag]
     else:
         std, order = float(np.sqrt(np.median(source.variance_m2ps2[:, :2]))), 1
         axes = [source.velocity_enu_mps[:, 0], source.velocity_enu_mps[:, 1]]
-    # The slope of a line through the samples of a window has √12 times their noise over √(samples), and over the window.
-    window_s = max(3.0 * period_s, (12.0 ** (order / 2.0) * std * period_s**0.5 / _SHOWN_MPS2) ** (1.0 / (order + 0.5)))
+    # The slope of a line through the samples of a window has √12 times their noise over √(samples), and over the window. It is to show
+    # 0.15 m/s², 1σ: half of the change that masks look for.
+    window_s = max(3.0 * period_s, (12.0 ** (order / 2.0) * std * period_s**0.5 / 0.15) ** (1.0 / (order + 0.5)))
     for _ in range(order):
         axes = [compute_slopes(source.stamp_ns, axis, window_s) for axis in axes]
     acceleration = np.minimum(np.hypot(*axes), MAX_ACCELERATION_MPS2)
-    density = np.maximum(max(_UNSEEN_LASTS_S, period_s) * (_UNSEEN_MPS2**2 + acceleration**2), least)
+    # Between two measurements it changes by 0.07 m/s², 1σ; it lasts for 0.2 s.
+    density = np.maximum(max(0.2, period_s) * (0.07**2 + acceleration**2), least)
     return np.asarray(np.interp(at_ns, source.stamp_ns, density))
 
 
 def _estimate_slide_density(visual: BodyVelocities | None) -> float:
     """Return the density of sideways and upward velocity [m²/s³]: as visual odometry shows it, or a guess."""
     if visual is None or visual.stamp_ns.size < 3:
-        return _SLIDE_DENSITY
-    shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _WINDOW_S) for axis in (1, 2)]
+        return 4e-4
+    shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], 1.0) for axis in (1, 2)]
     return max(_MIN_DENSITY, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)

@@ -14,14 +14,12 @@ Plane = NDArray[np.complex128]
 Signal = NDArray[Any]
 """Samples of a signal: real, complex or whole numbers."""
 
-_MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
 SPIKE_RATIO = 8.0
 """Least distance of a spike from the median around it, over the median of such distances [1]: more than 5σ."""
 MAX_GAP_NS = 500_000_000
 """Time between samples that no interpolation bridges [ns]: sensors of motion send at 2 Hz or more."""
 MAX_ACCELERATION_MPS2 = 2.5
 """Acceleration of a robot that brakes hard; what fixes show beyond it is an outlier [m/s²]."""
-_MIN_HOLD_NS = 1_000_000_000  # a value is held at least this long
 
 
 def compute_seconds(stamp_ns: Ints | int, zero_ns: int) -> Floats:
@@ -79,7 +77,7 @@ def is_in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) 
     return touches
 
 
-def is_covered(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, least_ns: int = _MIN_INPUT_GAP_NS) -> NDArray[np.bool_]:
+def is_covered(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, least_ns: int = 100_000_000) -> NDArray[np.bool_]:
     """Return whether each interval lies among samples without a gap, as `find_longest_step_ns` says."""
     return ~is_in_gap(stamp_ns, start_ns, end_ns, longest_ns=find_longest_step_ns(stamp_ns, least_ns))
 
@@ -95,7 +93,7 @@ def hold_last(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
         return np.full(at_ns.size, np.nan)
     index = np.searchsorted(stamp_ns, at_ns, "right") - 1
     last = np.maximum(index, 0)
-    is_known = (index >= 0) & (at_ns - stamp_ns[last] <= find_longest_step_ns(stamp_ns, _MIN_HOLD_NS))
+    is_known = (index >= 0) & (at_ns - stamp_ns[last] <= find_longest_step_ns(stamp_ns, 1_000_000_000))
     return np.where(is_known, values[last], np.nan)
 
 

@@ -24,8 +24,6 @@ import numpy as np
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion.filter_kernel import (
-    MOTION_WITH_GYRO,
-    MOTION_WITHOUT_GYRO,
     FilterModel,
     Indices,
     Steps,
@@ -33,7 +31,7 @@ from tcpipe.fusion.filter_kernel import (
     factorize,
     turn_rows,
 )
-from tcpipe.fusion.state import GYRO_TURN, KINDS, RHO, SIZES, Matrix, N, U, Vector, displace_state
+from tcpipe.fusion.state import KINDS, SIZES, Error, Matrix, Mode, N, Vector, displace_state
 
 
 class Candidates(NamedTuple):
@@ -75,7 +73,6 @@ class Smoothed(NamedTuple):
 NEAR, NEAR_EVERY, FAR_EVERY, SELDOM = 80, 4, 40, 100
 LARGEST_EVENT = 9
 """Errors that an event changes, at most."""
-_SHORT_M = 0.01
 
 
 class Adjoint(NamedTuple):
@@ -248,19 +245,19 @@ def _smooth_tick(
         s = 0.0
         for i in range(3):
             for j in range(3):
-                s += x[3 * axis + i] * x[3 * axis + j] * c[RHO + i, RHO + j]
+                s += x[3 * axis + i] * x[3 * axis + j] * c[Error.RHO + i, Error.RHO + j]
         out.variances[k, axis] = s
     level2 = max(x[0] * x[0] + x[3] * x[3], 1e-6)  # yaw = atan2(R10, R00)
     jy, jz = x[7] / level2, x[8] / level2
     out.variances[k, 3] = jy * jy * c[1, 1] + 2.0 * jy * jz * c[1, 2] + jz * jz * c[2, 2]
-    out.variances[k, 4] = c[U, U]
+    out.variances[k, 4] = c[Error.U, Error.U]
     # Displacements to later ticks, along their direction.
     for q in range(ticks.size):
         for column in range(lags.size):
             if ticks[q] < 0 or ticks[q] - k != lags[column]:
                 continue
             east, north = ends[q, 0] - out.states[k, 9], ends[q, 1] - out.states[k, 10]
-            short = 0.5 * _SHORT_M * _SHORT_M  # where the robot hardly moves, along any direction
+            short = 0.5 * 0.01 * 0.01  # m²: where the robot hardly moves, along any direction
             share = (east * east + short, 2.0 * east * north, north * north + short)
             s = 0.0
             for axis in range(2):
@@ -268,8 +265,8 @@ def _smooth_tick(
                     v = ends[q, 2 + axis + other]
                     for i in range(3):
                         for j in range(3):
-                            v += x[3 * axis + i] * x[3 * other + j] * c[RHO + i, RHO + j]
-                        line = P[RHO + i]
+                            v += x[3 * axis + i] * x[3 * other + j] * c[Error.RHO + i, Error.RHO + j]
+                        line = P[Error.RHO + i]
                         for j in range(n):
                             v -= line[j] * x[3 * axis + i] * rows[1 + 2 * q + other, j]
                             v -= line[j] * x[3 * other + i] * rows[1 + 2 * q + axis, j]
@@ -287,14 +284,14 @@ def _smooth_tick(
                 s = 0.0
                 for i in range(3):
                     for j in range(3):
-                        s += x[3 * axis + i] * x[3 * b + j] * c[RHO + i, RHO + j]
+                        s += x[3 * axis + i] * x[3 * b + j] * c[Error.RHO + i, Error.RHO + j]
                 ends[q, 2 + axis + b] = s
             after[:] = 0.0
             for j in range(n):
                 for i in range(3):
-                    after[j] += P[RHO + i, j] * x[3 * axis + i]
+                    after[j] += P[Error.RHO + i, j] * x[3 * axis + i]
             for i in range(n):
-                s = x[3 * axis + i - RHO] if RHO <= i < RHO + 3 else 0.0
+                s = x[3 * axis + i - Error.RHO] if Error.RHO <= i < Error.RHO + 3 else 0.0
                 for j in range(n):
                     s -= information[i, j] * after[j]
                 rows[1 + 2 * q + axis, i] = s
@@ -373,6 +370,6 @@ def smooth_ticks(
         if k >= candidates.earliest:
             _score_events(k, adjoint, candidates, C, L)
         if k > 0:
-            motion = MOTION_WITH_GYRO if inputs.mode[k] >= GYRO_TURN else MOTION_WITHOUT_GYRO
+            motion = KINDS + (inputs.mode[k] >= Mode.GYRO_TURN)
             places, m = model.depends[motion], model.counts[motion]
             step_before_motion(steps.F[row], steps.kept[row], places, m, adjoint, A)

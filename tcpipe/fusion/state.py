@@ -21,6 +21,7 @@ preintegration for real-time visual-inertial odometry", IEEE T-RO 33 (1), 2017.
 
 from __future__ import annotations
 
+from enum import IntEnum
 from math import atan2, cos, sin, sqrt
 
 import numpy as np
@@ -30,26 +31,40 @@ from tcpipe.compiled import compile_kernel
 
 GRAVITY_MPS2 = 9.80665  # standard gravity (CGPM 1901)
 
-THETA, RHO, U, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
-ARM, FIX_LAG, FIX_ERROR, FIX_OFFSET = 15, 18, 19, 22
-WHEEL_SCALE, VISUAL_SCALE, SHARED_SCALE, TURN_SCALE, TURNING_CENTRE = 25, 26, 27, 28, 29
-MOUNT, VISUAL_MOUNT, WHEEL_LAG, VISUAL_LAG, WHEEL_SLIP, VISUAL_SLIP = 30, 33, 35, 36, 37, 38
-POSE_MOUNT, POSE_FRAME = 39, 42
-N = 45
-"""Errors; their meaning from `ARM` on: `tcpipe.fusion.parameters.PARAMETERS`."""
-NX = N + 6
-MOVING = 15
-"""Errors before this one move with the robot; those from it on stay or decay."""
+N, MOVING, NX = 45, 15, 51
+"""Errors; the first of them, which move with the robot (those from `Error.ARM` on stay or decay); entries of the state."""
 
-KINDS = 9
-WHEELS, SIDEWAYS, VISUAL, STATIONARY, STATIONARY_RATE, LEVEL, DOPPLER, FIX, ATTITUDE = range(KINDS)
-"""Kinds of measurements. SIDEWAYS: sideways and upward velocity of the turning centre are about zero; STATIONARY: the velocity, and
-STATIONARY_RATE: the gyroscope's rate less its bias; LEVEL: roll and pitch are small; ATTITUDE: that of a pose."""
+
+class Error(IntEnum):
+    """First place of each part of the errors; from ``ARM`` on `tcpipe.fusion.parameters.PARAMETERS` has their meaning."""
+
+    THETA, RHO, U, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
+    ARM, FIX_LAG, FIX_ERROR, FIX_OFFSET = 15, 18, 19, 22
+    WHEEL_SCALE, VISUAL_SCALE, SHARED_SCALE, TURN_SCALE, TURNING_CENTRE = 25, 26, 27, 28, 29
+    MOUNT, VISUAL_MOUNT, WHEEL_LAG, VISUAL_LAG, WHEEL_SLIP, VISUAL_SLIP = 30, 33, 35, 36, 37, 38
+    POSE_MOUNT, POSE_FRAME = 39, 42
+
+
+class Kind(IntEnum):
+    """Kinds of measurements.
+
+    SIDEWAYS: sideways and upward velocity of the turning centre are about zero; STATIONARY: the velocity, and STATIONARY_RATE: the
+    gyroscope's rate less its bias; LEVEL: roll and pitch are small; ATTITUDE: that of a pose.
+    """
+
+    WHEELS, SIDEWAYS, VISUAL, STATIONARY, STATIONARY_RATE, LEVEL, DOPPLER, FIX, ATTITUDE = range(9)
+
+
+KINDS = len(Kind)
 SIZES = (1, 2, 3, 3, 3, 2, 3, 3, 3)
 """Components of each kind of measurement."""
 
-FLAT_TURN, VISUAL_TURN, GYRO_TURN, INERTIAL = range(4)
-"""What tells how the robot moves over a tick: the turn of wheels or course, that of a camera, a gyroscope, a whole IMU."""
+
+class Mode(IntEnum):
+    """What tells how the robot moves over a tick: the turn of wheels or course, that of a camera, a gyroscope, a whole IMU."""
+
+    FLAT_TURN, VISUAL_TURN, GYRO_TURN, INERTIAL = range(4)
+
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -89,9 +104,9 @@ def displace_state(x: Vector, d: Vector, sign: float, out: Vector, turn: Vector)
     make_rotation(sign * d[0], sign * d[1], sign * d[2], turn)
     multiply_rotations(x, turn, out)
     for i in range(3):
-        moved = x[3 * i] * d[RHO] + x[3 * i + 1] * d[RHO + 1] + x[3 * i + 2] * d[RHO + 2]
+        moved = x[3 * i] * d[Error.RHO] + x[3 * i + 1] * d[Error.RHO + 1] + x[3 * i + 2] * d[Error.RHO + 2]
         out[9 + i] = x[9 + i] + sign * moved
-    for e in range(U, N):
+    for e in range(Error.U, N):
         out[e + 6] = x[e + 6] + sign * d[e]
 
 
@@ -119,8 +134,8 @@ def compute_moving_error(y: Vector, x: Vector, out: Vector) -> None:
     """Fill the first `MOVING` of ``out`` with the error of ``y`` against ``x``."""
     compute_rotation_error(y, x, out)
     for j in range(3):
-        out[RHO + j] = x[j] * (y[9] - x[9]) + x[3 + j] * (y[10] - x[10]) + x[6 + j] * (y[11] - x[11])
-    for e in range(U, MOVING):
+        out[Error.RHO + j] = x[j] * (y[9] - x[9]) + x[3 + j] * (y[10] - x[10]) + x[6 + j] * (y[11] - x[11])
+    for e in range(Error.U, MOVING):
         out[e] = y[e + 6] - x[e + 6]
 
 
@@ -131,23 +146,23 @@ def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, o
     ``turned``: rotation matrix over the tick by the gyroscope, or the rotation vector by an odometry; ``gained``: velocity and
     displacement by the accelerometer, shape (6,). Both with the biases and the scale still in them.
     """
-    if mode >= GYRO_TURN:
-        s = 0.5 * x[TURN_SCALE + 6]  # half of the antisymmetric part is the rotation vector of a small turn
-        c0 = T * x[GYRO_BIAS + 6] + s * (turned[7] - turned[5])
-        c1 = T * x[GYRO_BIAS + 7] + s * (turned[2] - turned[6])
-        c2 = T * x[GYRO_BIAS + 8] + s * (turned[3] - turned[1])
+    if mode >= Mode.GYRO_TURN:
+        s = 0.5 * x[Error.TURN_SCALE + 6]  # half of the antisymmetric part is the rotation vector of a small turn
+        c0 = T * x[Error.GYRO_BIAS + 6] + s * (turned[7] - turned[5])
+        c1 = T * x[Error.GYRO_BIAS + 7] + s * (turned[2] - turned[6])
+        c2 = T * x[Error.GYRO_BIAS + 8] + s * (turned[3] - turned[1])
         make_rotation(-c0, -c1, -c2, out)
         multiply_rotations(turned, out, turn)
     else:
-        s = 1.0 - x[TURN_SCALE + 6]
+        s = 1.0 - x[Error.TURN_SCALE + 6]
         make_rotation(s * turned[0], s * turned[1], s * turned[2], turn)
-    u0, u1, u2 = x[U + 6], x[U + 7], x[U + 8]
+    u0, u1, u2 = x[Error.U + 6], x[Error.U + 7], x[Error.U + 8]
     s0, s1, s2 = u0 * T, u1 * T, u2 * T
     fall = 0.0
-    if mode == INERTIAL:
+    if mode == Mode.INERTIAL:
         h = 0.5 * T
-        a0, a1, a2 = x[ACCELEROMETER_BIAS + 6], x[ACCELEROMETER_BIAS + 7], x[ACCELEROMETER_BIAS + 8]
-        b0, b1, b2 = x[GYRO_BIAS + 6], x[GYRO_BIAS + 7], x[GYRO_BIAS + 8]
+        a0, a1, a2 = x[Error.ACCELEROMETER_BIAS + 6], x[Error.ACCELEROMETER_BIAS + 7], x[Error.ACCELEROMETER_BIAS + 8]
+        b0, b1, b2 = x[Error.GYRO_BIAS + 6], x[Error.GYRO_BIAS + 7], x[Error.GYRO_BIAS + 8]
         v0, v1, v2 = gained[0], gained[1], gained[2]
         s0 += gained[3] - h * T * a0
         s1 += gained[4] - h * T * a1
@@ -159,9 +174,9 @@ def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, o
         u2 += v2 - T * (a2 + GRAVITY_MPS2 * x[8])
         fall = 0.5 * GRAVITY_MPS2 * T * T
         for j in range(3):
-            out[U + 6 + j] = turn[j] * u0 + turn[3 + j] * u1 + turn[6 + j] * u2
+            out[Error.U + 6 + j] = turn[j] * u0 + turn[3 + j] * u1 + turn[6 + j] * u2
     else:  # the body keeps its velocity: half of the turn on the way
-        out[U + 6], out[U + 7], out[U + 8] = u0, u1, u2
+        out[Error.U + 6], out[Error.U + 7], out[Error.U + 8] = u0, u1, u2
         m0 = s0 + turn[0] * s0 + turn[1] * s1 + turn[2] * s2
         m1 = s1 + turn[3] * s0 + turn[4] * s1 + turn[5] * s2
         m2 = s2 + turn[6] * s0 + turn[7] * s1 + turn[8] * s2
@@ -170,7 +185,7 @@ def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, o
         out[9 + i] = x[9 + i] + x[3 * i] * s0 + x[3 * i + 1] * s1 + x[3 * i + 2] * s2
     out[11] -= fall
     multiply_rotations(x, turn, out)
-    for e in range(GYRO_BIAS, N):
+    for e in range(Error.GYRO_BIAS, N):
         out[e + 6] = x[e + 6]
 
 
@@ -180,11 +195,11 @@ def _predict_attitude(x: Vector, w0: float, w1: float, w2: float, t: float, meas
     one, other, turn = np.empty(9), np.empty(9), np.empty(9)
     make_rotation(t * w0, t * w1, t * w2, turn)
     multiply_rotations(x, turn, one)
-    make_rotation(x[MOUNT + 6], x[MOUNT + 7], x[MOUNT + 8], turn)
+    make_rotation(x[Error.MOUNT + 6], x[Error.MOUNT + 7], x[Error.MOUNT + 8], turn)
     multiply_rotations(one, turn, other)
-    make_rotation(x[POSE_MOUNT + 6], x[POSE_MOUNT + 7], x[POSE_MOUNT + 8], turn)
+    make_rotation(x[Error.POSE_MOUNT + 6], x[Error.POSE_MOUNT + 7], x[Error.POSE_MOUNT + 8], turn)
     multiply_rotations(other, turn, one)
-    make_rotation(x[POSE_FRAME + 6], x[POSE_FRAME + 7], x[POSE_FRAME + 8], turn)
+    make_rotation(x[Error.POSE_FRAME + 6], x[Error.POSE_FRAME + 7], x[Error.POSE_FRAME + 8], turn)
     multiply_rotations(turn, one, other)
     make_rotation(measured[0], measured[1], measured[2], one)
     compute_rotation_error(other, one, out)
@@ -200,31 +215,35 @@ def predict_measurement(
     measurement after the tick [s]; ``lever``: place of an odometry on the robot. A pose measures its own attitude, the rotation vector
     ``lever``: what is predicted is the rotation from there.
     """
-    if kind == STATIONARY:
-        out[0], out[1], out[2] = x[U + 6], x[U + 7], x[U + 8]
+    if kind == Kind.STATIONARY:
+        out[0], out[1], out[2] = x[Error.U + 6], x[Error.U + 7], x[Error.U + 8]
         return
-    if kind == STATIONARY_RATE:
-        out[0], out[1], out[2] = x[GYRO_BIAS + 6], x[GYRO_BIAS + 7], x[GYRO_BIAS + 8]
+    if kind == Kind.STATIONARY_RATE:
+        out[0], out[1], out[2] = x[Error.GYRO_BIAS + 6], x[Error.GYRO_BIAS + 7], x[Error.GYRO_BIAS + 8]
         return
-    if kind == LEVEL:
+    if kind == Kind.LEVEL:
         out[0], out[1] = x[6], x[7]
         return
-    m0, m1, m2 = x[MOUNT + 6], x[MOUNT + 7], x[MOUNT + 8]
+    m0, m1, m2 = x[Error.MOUNT + 6], x[Error.MOUNT + 7], x[Error.MOUNT + 8]
     if has_gyro:
-        w0, w1, w2 = rate[0] - x[GYRO_BIAS + 6], rate[1] - x[GYRO_BIAS + 7], rate[2] - x[GYRO_BIAS + 8]
+        w0, w1, w2 = (
+            rate[0] - x[Error.GYRO_BIAS + 6],
+            rate[1] - x[Error.GYRO_BIAS + 7],
+            rate[2] - x[Error.GYRO_BIAS + 8],
+        )
     else:  # beside a lever arm the noise of the rate would look like a scale
         w0, w1, w2 = rate[0], rate[1], rate[2]
-    if kind == ATTITUDE:
-        _predict_attitude(x, w0, w1, w2, tau - x[FIX_LAG + 6], lever, out)
+    if kind == Kind.ATTITUDE:
+        _predict_attitude(x, w0, w1, w2, tau - x[Error.FIX_LAG + 6], lever, out)
         return
-    if kind >= DOPPLER:  # the antenna's place turned by the mounting of the IMU, whose axes are the state's
-        a0, a1, a2 = x[ARM + 6], x[ARM + 7], x[ARM + 8]
+    if kind >= Kind.DOPPLER:  # the antenna's place turned by the mounting of the IMU, whose axes are the state's
+        a0, a1, a2 = x[Error.ARM + 6], x[Error.ARM + 7], x[Error.ARM + 8]
         a0, a1, a2 = a0 + m1 * a2 - m2 * a1, a1 + m2 * a0 - m0 * a2, a2 + m0 * a1 - m1 * a0
-        t = tau - x[FIX_LAG + 6]
-        v0 = x[U + 6] + t * acceleration[0] + w1 * a2 - w2 * a1
-        v1 = x[U + 7] + t * acceleration[1] + w2 * a0 - w0 * a2
-        v2 = x[U + 8] + t * acceleration[2] + w0 * a1 - w1 * a0
-        if kind == DOPPLER:
+        t = tau - x[Error.FIX_LAG + 6]
+        v0 = x[Error.U + 6] + t * acceleration[0] + w1 * a2 - w2 * a1
+        v1 = x[Error.U + 7] + t * acceleration[1] + w2 * a0 - w0 * a2
+        v2 = x[Error.U + 8] + t * acceleration[2] + w0 * a1 - w1 * a0
+        if kind == Kind.DOPPLER:
             for i in range(3):
                 out[i] = x[3 * i] * v0 + x[3 * i + 1] * v1 + x[3 * i + 2] * v2
             return
@@ -233,25 +252,29 @@ def predict_measurement(
         a2 += t * (v2 - 0.5 * t * acceleration[2])
         for i in range(3):
             out[i] = x[9 + i] + x[3 * i] * a0 + x[3 * i + 1] * a1 + x[3 * i + 2] * a2
-            out[i] += x[FIX_ERROR + 6 + i] + x[FIX_OFFSET + 6 + i]
+            out[i] += x[Error.FIX_ERROR + 6 + i] + x[Error.FIX_OFFSET + 6 + i]
         return
     t = tau
-    if kind == WHEELS:
-        t -= x[WHEEL_LAG + 6]
-    elif kind == VISUAL:
-        t -= x[VISUAL_LAG + 6]
-    u0, u1, u2 = x[U + 6] + t * acceleration[0], x[U + 7] + t * acceleration[1], x[U + 8] + t * acceleration[2]
+    if kind == Kind.WHEELS:
+        t -= x[Error.WHEEL_LAG + 6]
+    elif kind == Kind.VISUAL:
+        t -= x[Error.VISUAL_LAG + 6]
+    u0, u1, u2 = (
+        x[Error.U + 6] + t * acceleration[0],
+        x[Error.U + 7] + t * acceleration[1],
+        x[Error.U + 8] + t * acceleration[2],
+    )
     # From the axes of the IMU to those of the robot.
     v0, v1, v2 = u0 - m1 * u2 + m2 * u1, u1 - m2 * u0 + m0 * u2, u2 - m0 * u1 + m1 * u0
     w0, w1, w2 = w0 - m1 * w2 + m2 * w1, w1 - m2 * w0 + m0 * w2, w2 - m0 * w1 + m1 * w0
     v0 += w1 * lever[2] - w2 * lever[1]
     v1 += w2 * lever[0] - w0 * lever[2]
     v2 += w0 * lever[1] - w1 * lever[0]
-    if kind == SIDEWAYS:
-        out[0], out[1] = v1 + w2 * x[TURNING_CENTRE + 6], v2
-    elif kind == WHEELS:
-        out[0] = v0 * (1.0 + x[WHEEL_SCALE + 6] + x[WHEEL_SLIP + 6] + x[SHARED_SCALE + 6])
+    if kind == Kind.SIDEWAYS:
+        out[0], out[1] = v1 + w2 * x[Error.TURNING_CENTRE + 6], v2
+    elif kind == Kind.WHEELS:
+        out[0] = v0 * (1.0 + x[Error.WHEEL_SCALE + 6] + x[Error.WHEEL_SLIP + 6] + x[Error.SHARED_SCALE + 6])
     else:
-        c1, c2 = x[VISUAL_MOUNT + 6], x[VISUAL_MOUNT + 7]
-        s = 1.0 + x[VISUAL_SCALE + 6] + x[VISUAL_SLIP + 6] + x[SHARED_SCALE + 6]
+        c1, c2 = x[Error.VISUAL_MOUNT + 6], x[Error.VISUAL_MOUNT + 7]
+        s = 1.0 + x[Error.VISUAL_SCALE + 6] + x[Error.VISUAL_SLIP + 6] + x[Error.SHARED_SCALE + 6]
         out[0], out[1], out[2] = s * (v0 - c1 * v2 + c2 * v1), s * (v1 - c2 * v0), s * (v2 + c1 * v0)

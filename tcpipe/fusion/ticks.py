@@ -19,11 +19,10 @@ from tcpipe.arrays import Floats, Ints
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
 from tcpipe.fusion.dead_reckoning import compute_course_rate
-from tcpipe.fusion.densities import DETERMINED, NoiseModel
+from tcpipe.fusion.densities import DETERMINED, PRIORS, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory, Tests, TickInputs
-from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, Measurements
+from tcpipe.fusion.measurements import NO_TRUST, VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import (
-    DOPPLER_LASTS_S,
     UNSEEN_TURN_RADPS,
     is_turned_by_course,
     make_motion_noise,
@@ -37,22 +36,12 @@ from tcpipe.fusion.signals import (
     compute_slopes,
     is_covered,
 )
+from tcpipe.fusion.state import Kind, Mode
 from tcpipe.geometry.rotation import rotation_vector_from_quat
 from tcpipe.robust import estimate_robust_std
 
 _LONGEST_NS = 50_000_000
 _STATIONARY_EVERY_S = 0.2
-_STATIONARY_STD_MPS = 0.01  # a robot that stands rocks
-_STATIONARY_RATE_STD_RADPS = 5e-4
-_LEVEL_EVERY_S, _LEVEL_STD_RAD = 1.0, 0.7
-"""Time between roll and pitch of zero without an accelerometer [s], and their σ [rad]."""
-_UNMEASURED = 1e6  # m²/s²
-_LEAST_M2PS = 4e-6  # 2 mm after a second: the mean of a tick is no better than that
-_MOVING_MPS = 0.05  # slower is stationary (ruling)
-_ACCELERATION_WINDOW_S = 0.4
-# Sideways velocities are independent after this time: what lasts longer of them is in the states of turning centre and mounting.
-_SLIDE_LASTS_S = 0.016
-_LASTING_S = 0.1  # errors of an odometry beyond its white noise are independent after this time
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,49 +110,50 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
             variance[has_samples, kind, axis] = mean(variances[:, axis]) / count[has_samples]
         tau[has_samples, kind] = mean(offset_s)
 
-    for kind, role, source in ((state.WHEELS, WHEELS, m.wheels), (state.VISUAL, VISUAL, m.visual)):
+    for kind, role, source in ((Kind.WHEELS, WHEELS, m.wheels), (Kind.VISUAL, VISUAL, m.visual)):
         if source is not None:
             levers[kind] = source.lever_arm_m
-            axes = 1 if kind == state.WHEELS else 3
+            axes = 1 if kind == Kind.WHEELS else 3
             put(kind, source.stamp_ns, source.velocity_mps[:, :axes], _make_velocity_variance(m, source, noise, role))
     fix_variance = np.zeros((size, 3))
     if m.gnss is not None:
         white, correlated = _compute_shares(noise)
-        put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * white)
+        put(Kind.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * white)
         nearest = np.searchsorted(m.gnss.stamp_ns, stamp_ns).clip(0, m.gnss.stamp_ns.size - 1)
         fix_variance = m.gnss.variance_m2[nearest] * correlated
     attitude = np.zeros((size, 3))
     if m.gnss is not None and m.gnss.quat_xyzw is not None and m.gnss.rotation_variance_rad2 is not None:
-        measured = np.where(np.isfinite(m.gnss.quat_xyzw).all(1), rows[state.FIX], -1)
+        measured = np.where(np.isfinite(m.gnss.quat_xyzw).all(1), rows[Kind.FIX], -1)
         known = np.flatnonzero(measured >= 0)
         at, first = np.unique(measured[known], return_index=True)  # rotations have no mean: one a tick
         chosen = known[first]
         attitude[at] = rotation_vector_from_quat(m.gnss.quat_xyzw[chosen])
-        put(state.ATTITUDE, m.gnss.stamp_ns[chosen], np.zeros((at.size, 3)), m.gnss.rotation_variance_rad2[chosen])
-        rows[state.ATTITUDE] = measured
+        put(Kind.ATTITUDE, m.gnss.stamp_ns[chosen], np.zeros((at.size, 3)), m.gnss.rotation_variance_rad2[chosen])
+        rows[Kind.ATTITUDE] = measured
     if m.gnss is not None and m.doppler is not None:
-        lasting = max(1.0, DOPPLER_LASTS_S * 1e9 / compute_median_period_ns(m.doppler.stamp_ns))
+        # Weight of a correlation that fades in 1.5 s.
+        lasting = max(1.0, 3.0 * 1e9 / compute_median_period_ns(m.doppler.stamp_ns))
         variances = m.doppler.variance_m2ps2 * lasting
         if not m.has_tilt:
             variances = variances + _compute_unseen_turn_variance(m.doppler.stamp_ns, m.gnss.lever_arm_m)
-        put(state.DOPPLER, m.doppler.stamp_ns, m.doppler.velocity_enu_mps, variances)
+        put(Kind.DOPPLER, m.doppler.stamp_ns, m.doppler.velocity_enu_mps, variances)
     _add_constraints(m, stationary_ns, stamp_ns, value, variance, period_s=period_s)
     if m.wheels is not None:
-        levers[state.SIDEWAYS] = m.wheels.lever_arm_m
+        levers[Kind.SIDEWAYS] = m.wheels.lever_arm_m
 
     before_ns = stamp_ns - tick_ns
     turn_rate, mode = _find_turn_rates(m, before_ns, stamp_ns, int(stamp_ns[0]))
     rate, around = _find_turn_rates(m, stamp_ns - tick_ns // 2, stamp_ns + tick_ns // 2, int(stamp_ns[0]))
     turned, gained = np.zeros((size, 9)), np.zeros((size, 6))
     turned[:, :3] = turn_rate * period_s
-    by_gyro = np.flatnonzero(mode == state.GYRO_TURN)
+    by_gyro = np.flatnonzero(mode == Mode.GYRO_TURN)
     if m.imu is not None and by_gyro.size:
         imu_s, end_s = compute_seconds(m.imu.stamp_ns, int(stamp_ns[0])), compute_seconds(stamp_ns, int(stamp_ns[0]))
         _preintegrate(
             imu_s, m.imu.angular_velocity_radps, m.imu.specific_force_mps2, end_s, period_s, by_gyro, turned, gained
         )
         if m.imu.accelerometer_usable:
-            mode[by_gyro] = state.INERTIAL
+            mode[by_gyro] = Mode.INERTIAL
     kept, fix_noise = _make_fix_process(noise, fix_variance, period_s)
     inputs = TickInputs(
         period_s,
@@ -172,7 +162,7 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
         gained,
         make_motion_noise(m, noise, stamp_ns, mode, turn_rate, period_s),
         rate,
-        around >= state.GYRO_TURN,
+        around >= Mode.GYRO_TURN,
         _compute_acceleration(m, stamp_ns),
         value,
         variance,
@@ -210,13 +200,13 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     found = claimed.copy()
     relative = claimed[:, 0] / np.median(claimed[:, 0])
     of_run, scatter = noise.odometries[role], _estimate_scatter(source.velocity_mps[:, 0])
-    density = max(of_run.white, _LEAST_M2PS)
-    if of_run.white_data_share < DETERMINED:  # what is claimed beyond the scatter of the samples lasts
-        density = max(density, _LASTING_S * (float(np.median(claimed[:, 0])) - scatter))
+    density = max(of_run.white, PRIORS[f"{role} velocity"].variance)  # the mean of a tick is no better
+    if of_run.white_data_share < DETERMINED:  # what is claimed beyond the scatter of the samples lasts for 0.1 s
+        density = max(density, 0.1 * (float(np.median(claimed[:, 0])) - scatter))
     found[:, 0] = max(density * rate_hz, scatter) * np.maximum(relative, 1.0)
     for axis in range(1, 3):
         if not np.isfinite(claimed[:, axis]).all() or np.ptp(source.velocity_mps[:, axis]) == 0.0:
-            found[:, axis] = _UNMEASURED  # an axis that is always zero is a constraint, not a measurement
+            found[:, axis] = NO_TRUST  # an axis that is always zero is a constraint, not a measurement
     flat = source.turn_rate_radps is None and m.imu is None and role == VISUAL
     if flat:
         found = found + _compute_unseen_turn_variance(source.stamp_ns, source.lever_arm_m)
@@ -225,7 +215,7 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
 
 def _estimate_scatter(velocity_mps: Floats) -> float:
     """Return the variance of a moving odometry's samples around their neighbours', by the median: wild ones do not move it."""
-    second = np.diff(velocity_mps, n=2)[(np.abs(velocity_mps) > _MOVING_MPS)[1:-1]]
+    second = np.diff(velocity_mps, n=2)[(np.abs(velocity_mps) > 0.05)[1:-1]]
     return estimate_robust_std(second) ** 2 / 6.0 if second.size > 1 else 0.0
 
 
@@ -241,13 +231,14 @@ def _add_constraints(
 ) -> None:
     if m.is_antenna_alone:  # which way the body looks is not known
         return
-    value[:, state.SIDEWAYS, :2] = 0.0
-    variance[:, state.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * _SLIDE_LASTS_S / period_s
+    value[:, Kind.SIDEWAYS, :2] = 0.0
+    # Sideways velocities are independent after 16 ms: what lasts longer of them is in the states of turning centre and mounting.
+    variance[:, Kind.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * 0.016 / period_s
     imu = m.imu
     if imu is None or not imu.accelerometer_usable:
-        every = max(1, round(_LEVEL_EVERY_S / period_s))
-        value[::every, state.LEVEL, :2] = 0.0
-        variance[::every, state.LEVEL, :2] = _LEVEL_STD_RAD**2
+        every = max(1, round(1.0 / period_s))  # each second
+        value[::every, Kind.LEVEL, :2] = 0.0
+        variance[::every, Kind.LEVEL, :2] = 0.7**2  # rad²
     if imu is None or not stationary_ns.size:
         return
     inside = np.zeros(stamp_ns.size, np.bool_)
@@ -258,13 +249,13 @@ def _add_constraints(
     zero = int(stamp_ns[0])
     at_s, half_s = compute_seconds(stamp_ns[rows], zero), 0.5 * _STATIONARY_EVERY_S
     samples = max(1.0, _STATIONARY_EVERY_S * 1e9 / compute_median_period_ns(imu.stamp_ns))
-    value[rows, state.STATIONARY] = 0.0
-    variance[rows, state.STATIONARY] = _STATIONARY_STD_MPS**2
+    value[rows, Kind.STATIONARY] = 0.0
+    variance[rows, Kind.STATIONARY] = 0.01**2  # m²/s²: a stationary robot rocks
     imu_s = compute_seconds(imu.stamp_ns, zero)
-    value[rows, state.STATIONARY_RATE] = compute_interval_means(
+    value[rows, Kind.STATIONARY_RATE] = compute_interval_means(
         imu_s, imu.angular_velocity_radps, at_s - half_s, at_s + half_s
     )
-    variance[rows, state.STATIONARY_RATE] = imu.gyro_std_radps**2 / samples + _STATIONARY_RATE_STD_RADPS**2
+    variance[rows, Kind.STATIONARY_RATE] = imu.gyro_std_radps**2 / samples + 5e-4**2
 
 
 @compile_kernel
@@ -319,7 +310,7 @@ def _compute_acceleration(m: Measurements, stamp_ns: Ints) -> Floats:
 def _compute_slope(source: BodyVelocities, stamp_ns: Ints) -> Floats:
     if source.stamp_ns.size < 3:
         return np.zeros(stamp_ns.size)
-    slope = compute_slopes(source.stamp_ns, compute_running_median(source.velocity_mps[:, 0]), _ACCELERATION_WINDOW_S)
+    slope = compute_slopes(source.stamp_ns, compute_running_median(source.velocity_mps[:, 0]), 0.4)
     zero = int(stamp_ns[0])
     found = np.interp(compute_seconds(stamp_ns, zero), compute_seconds(source.stamp_ns, zero), slope)
     return np.where(is_covered(source.stamp_ns, stamp_ns, stamp_ns), found, 0.0)
@@ -331,7 +322,7 @@ def _find_turn_rates(m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: 
     if imu is None:
         return _compute_odometric_turn_rate(m, before_ns, after_ns, zero_ns)
     covered = is_covered(imu.stamp_ns, before_ns, after_ns)
-    rate, mode = np.zeros((before_ns.size, 3)), np.full(before_ns.size, state.GYRO_TURN, np.int8)
+    rate, mode = np.zeros((before_ns.size, 3)), np.full(before_ns.size, Mode.GYRO_TURN, np.int8)
     rate[covered] = compute_interval_means(
         compute_seconds(imu.stamp_ns, zero_ns),
         imu.angular_velocity_radps,
@@ -346,7 +337,7 @@ def _compute_odometric_turn_rate(
 ) -> tuple[Floats, NDArray[np.int8]]:
     """Return the mean angular velocity by the odometries, shape (K, 3), and the mode; by the course over ground where it alone shows it."""
     rate = np.zeros((before_ns.size, 3))
-    mode = np.full(before_ns.size, state.FLAT_TURN, np.int8)
+    mode = np.full(before_ns.size, Mode.FLAT_TURN, np.int8)
     start_s, end_s = compute_seconds(before_ns, zero_ns), compute_seconds(after_ns, zero_ns)
     if m.gnss is not None and is_turned_by_course(m):
         stamp_s, values = compute_course_rate(m.gnss, m.first_odometry, zero_ns)
@@ -358,5 +349,5 @@ def _compute_odometric_turn_rate(
         inside = is_covered(source.stamp_ns[known], before_ns, after_ns) | (rank == 0)
         stamp_s = compute_seconds(source.stamp_ns[known], zero_ns)
         rate[inside] = compute_interval_means(stamp_s, values[known], start_s[inside], end_s[inside])
-        mode[inside] = state.VISUAL_TURN if source is m.visual else state.FLAT_TURN
+        mode[inside] = Mode.VISUAL_TURN if source is m.visual else Mode.FLAT_TURN
     return rate, mode

@@ -10,6 +10,7 @@ The state of filterpy is the error of the estimate, zero between its steps: no a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -19,23 +20,21 @@ from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
 from tcpipe.fusion.changes import Hypothesis
 from tcpipe.fusion.error_state import make_tests, make_trajectory, prepare_section
-from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, FilterModel, Memory
+from tcpipe.fusion.filter_kernel import FilterModel, Memory, Verdict
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S, InitialState, Measurements, Trajectory
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed
+from tcpipe.fusion.state import Error, Kind
 from tcpipe.fusion.ticks import Pass, Ticks
 
 _MAX_ANGLE_STD_RAD = 1.0  # sigma points lie at √3 σ, and must not go round the circle
-_RESET_COUNT, _RESET_S = 5, 5.0
-"""Rejections in a row of one kind of measurement, and their least duration [s], after which the gate is reset."""
-_RESET_VELOCITY_STD_MPS = 0.3  # that of the start
-_MEASURED_ERRORS = {
-    state.WHEELS: state.U,
-    state.VISUAL: state.U,
-    state.DOPPLER: state.U,
-    state.STATIONARY: state.U,
-    state.STATIONARY_RATE: state.GYRO_BIAS,
-    state.FIX: state.RHO,
-    state.ATTITUDE: state.THETA,
+_MEASURED_ERRORS: Mapping[int, int] = {
+    Kind.WHEELS: Error.U,
+    Kind.VISUAL: Error.U,
+    Kind.DOPPLER: Error.U,
+    Kind.STATIONARY: Error.U,
+    Kind.STATIONARY_RATE: Error.GYRO_BIAS,
+    Kind.FIX: Error.RHO,
+    Kind.ATTITUDE: Error.THETA,
 }
 """First of the three errors that a gate reset inflates, by kind of measurement."""
 
@@ -73,17 +72,17 @@ def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pas
         if k > 0:
             ukf.predict(k)
         for kind in np.flatnonzero(np.isfinite(ticks.inputs.value[k, :, 0])).tolist():
-            verdict, innovation, nis = ACCEPTED, *ukf.update(k, kind, model.gates[kind])
-            if kind == state.FIX:
+            verdict, innovation, nis = Verdict.ACCEPTED, *ukf.update(k, kind, model.gates[kind])
+            if kind == Kind.FIX:
                 tests.fix_innovation[k] = innovation
             if not nis <= model.gates[kind]:
-                verdict, since = REJECTED, rejected[kind]
+                verdict, since = Verdict.REJECTED, rejected[kind]
                 since.append(k)
-                if len(since) >= _RESET_COUNT and (k - since[0]) * period_s >= _RESET_S:
-                    verdict = RESET
+                if len(since) >= 5 and (k - since[0]) * period_s >= 5.0:
+                    verdict = Verdict.RESET
                     ukf.inflate(kind, innovation)
                     ukf.update(k, kind, np.inf)
-            if verdict != REJECTED:
+            if verdict != Verdict.REJECTED:
                 rejected[kind].clear()
             tests.nis[k, kind], tests.verdict[k, kind] = nis, verdict
         states[k], variances[k] = ukf.x, ukf.compute_variances()
@@ -103,7 +102,7 @@ class _Filter:
         self._ukf = UnscentedKalmanFilter(size, 1, ticks.inputs.period_s, None, None, points)
         self._ukf.P, self.x = _repair(start.P), start.x.copy()
         self._inputs, self._model = ticks.inputs, model
-        self._is_fix_error = (model.active >= state.FIX_ERROR) & (model.active < state.FIX_ERROR + 3)
+        self._is_fix_error = (model.active >= Error.FIX_ERROR) & (model.active < Error.FIX_ERROR + 3)
 
     @property
     def covariance(self) -> Floats:
@@ -115,10 +114,10 @@ class _Filter:
         inputs, model, before = self._inputs, self._model, self.x
         kept, noise = model.kept.copy(), model.noise.copy()
         kept[self._is_fix_error] = inputs.fix_kept[k]
-        noise[self._is_fix_error] += inputs.fix_noise[k, model.active[self._is_fix_error] - state.FIX_ERROR]
+        noise[self._is_fix_error] += inputs.fix_noise[k, model.active[self._is_fix_error] - Error.FIX_ERROR]
         # Rotation, position and velocity are always active, and first.
-        noise[state.THETA : state.THETA + 3] += inputs.noise[k, :3]
-        noise[state.U : state.U + 3] += inputs.noise[k, 3:]
+        noise[Error.THETA : Error.THETA + 3] += inputs.noise[k, :3]
+        noise[Error.U : Error.U + 3] += inputs.noise[k, 3:]
         motion = inputs.mode[k], inputs.period_s, inputs.turned[k], inputs.gained[k]
         moving = np.flatnonzero(model.active < state.MOVING)
 
@@ -144,7 +143,7 @@ class _Filter:
     def update(self, k: int, kind: int, gate: float) -> tuple[Floats, float]:
         """Use one measurement of tick k; return its innovation, and the square of this, normalised. Beyond the gate nothing changes."""
         inputs, ukf, size, prior = self._inputs, self._ukf, state.SIZES[kind], self.covariance
-        lever = inputs.attitude[k] if kind == state.ATTITUDE else inputs.levers[kind]
+        lever = inputs.attitude[k] if kind == Kind.ATTITUDE else inputs.levers[kind]
         acceleration = np.array([inputs.acceleration[k], 0.0, 0.0])
         circumstances = inputs.rate[k], inputs.has_gyro[k], acceleration, inputs.tau[k, kind], lever
 
@@ -167,10 +166,10 @@ class _Filter:
         first = int(np.searchsorted(self._model.active, _MEASURED_ERRORS[kind]))
         variance = float(innovation @ innovation)
         rows = [first, first + 1, first + 2]
-        self._ukf.P[rows, rows] += variance if first != state.THETA else min(variance, _MAX_ANGLE_STD_RAD**2)
-        if kind == state.FIX:  # a wrong yaw and velocity lead positions astray
-            rows = [state.THETA + 2, *range(state.U, state.U + 3)]
-            self._ukf.P[rows, rows] += np.square([_MAX_ANGLE_STD_RAD, *[_RESET_VELOCITY_STD_MPS] * 3])
+        self._ukf.P[rows, rows] += variance if first != Error.THETA else min(variance, _MAX_ANGLE_STD_RAD**2)
+        if kind == Kind.FIX:  # a wrong yaw and velocity lead positions astray
+            rows = [Error.THETA + 2, *range(Error.U, Error.U + 3)]
+            self._ukf.P[rows, rows] += np.square([_MAX_ANGLE_STD_RAD, 0.3, 0.3, 0.3])  # m/s: as at the start
 
     def compute_variances(self) -> Floats:
         """Return the variance of position east, north, up [m²], of yaw [rad²] and of forward velocity [m²/s²], shape (5,)."""
@@ -178,9 +177,9 @@ class _Filter:
         yaw[[1, 2]] = np.array([x[7], x[8]]) / max(x[0] ** 2 + x[3] ** 2, 1e-6)  # of atan2(R10, R00) by rotation errors
         if self._model.mount >= 0:  # the robot turns with the IMU and with its mounting
             yaw[self._model.mount : self._model.mount + 3] = yaw[:3]
-        R, to_position = x[:9].reshape(3, 3), slice(state.RHO, state.RHO + 3)
+        R, to_position = x[:9].reshape(3, 3), slice(Error.RHO, Error.RHO + 3)
         position = np.einsum("ij,jk,ik->i", R, P[to_position, to_position], R)
-        return np.array([*position, yaw @ P @ yaw, P[state.U, state.U]])
+        return np.array([*position, yaw @ P @ yaw, P[Error.U, Error.U]])
 
     def _displace(self, x: Floats, errors: Floats) -> Floats:
         """Return the state that lies active errors, shape (n,), off a state."""
@@ -193,7 +192,7 @@ class _Filter:
         """Move the error that filterpy has found into the estimate, and turn the axes of rotation and position errors with it."""
         ukf, turn = self._ukf, np.eye(self._model.active.size)
         # The right Jacobian of SO(3) to second order (Solà 2017, eq. 183).
-        for first, share in ((state.THETA, -0.5), (state.RHO, -1.0)):
+        for first, share in ((Error.THETA, -0.5), (Error.RHO, -1.0)):
             block = np.empty(9)
             state.make_rotation(*(share * ukf.x[:3]), block)
             turn[first : first + 3, first : first + 3] = block.reshape(3, 3)

@@ -10,7 +10,8 @@ from unit.fusion.test_error_state import fuse, smoothed, truth
 from tcpipe.fusion import state
 from tcpipe.fusion.changes import Change, Hypothesis, compute_evidence, is_contradicted, join_events
 from tcpipe.fusion.error_state import make_tests
-from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED
+from tcpipe.fusion.filter_kernel import Verdict
+from tcpipe.fusion.state import Error, Kind
 
 
 def shift(m, share, offset_m=(1.0, 0.0, 0.0)):
@@ -167,15 +168,15 @@ def test_nothing_happened_in_a_clean_run():
 
 def test_sensors_contradict_each_other_where_one_is_rejected_five_times_in_a_row_for_a_second():
     tests = make_tests(400)
-    tests.verdict[::2, state.FIX] = ACCEPTED
-    tests.verdict[200:216:2, state.FIX] = REJECTED
+    tests.verdict[::2, Kind.FIX] = Verdict.ACCEPTED
+    tests.verdict[200:216:2, Kind.FIX] = Verdict.REJECTED
     assert not is_contradicted(tests, 0.05)
-    tests.verdict[100:140:2, state.FIX] = REJECTED
+    tests.verdict[100:140:2, Kind.FIX] = Verdict.REJECTED
     assert is_contradicted(tests, 0.05)
 
 
 def make_offset(first, east_m):
-    return Change("offset", state.FIX, first, impulse=(east_m, 0.0, 0.0))
+    return Change("offset", Kind.FIX, first, impulse=(east_m, 0.0, 0.0))
 
 
 def test_an_offset_that_returns_is_a_span_and_one_that_stays_is_a_step():
@@ -187,19 +188,19 @@ def test_an_offset_that_returns_is_a_span_and_one_that_stays_is_a_step():
 
 def test_evidence_counts_what_is_beyond_the_gate_as_the_gate():
     tests = make_tests(3)
-    tests.nis[:, state.FIX], tests.log_det[:, state.FIX] = [1.0, 100.0, 2.0], [-1.0, -2.0, -3.0]
+    tests.nis[:, Kind.FIX], tests.log_det[:, Kind.FIX] = [1.0, 100.0, 2.0], [-1.0, -2.0, -3.0]
     gates = np.full(state.KINDS, np.inf)
-    gates[state.FIX] = 16.0
+    gates[Kind.FIX] = 16.0
     assert compute_evidence(tests, gates) == pytest.approx(-0.5 * (1.0 + 16.0 + 2.0 - 6.0))
 
 
 def test_events_are_in_order_of_time():
-    scale = Change("scale", state.WHEELS, 50, 90, impulse=(0.3,), impulse_std=(0.01,))
-    best = Hypothesis((scale, Change("clock", state.FIX, 20, impulse=(0.2,), impulse_std=(0.01,))))
+    scale = Change("scale", Kind.WHEELS, 50, 90, impulse=(0.3,), impulse_std=(0.01,))
+    best = Hypothesis((scale, Change("clock", Kind.FIX, 20, impulse=(0.2,), impulse_std=(0.01,))))
     assert [(event.tick, event.place) for event in best.events] == [
-        (20, state.FIX_LAG),
-        (50, state.WHEEL_SCALE),
-        (90, state.WHEEL_SCALE),
+        (20, Error.FIX_LAG),
+        (50, Error.WHEEL_SCALE),
+        (90, Error.WHEEL_SCALE),
     ]
     assert [(event.mean, event.std) for event in best.events][1:] == [(0.3, 0.03), (-0.3, 0.03)]
 

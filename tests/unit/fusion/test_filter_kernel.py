@@ -9,7 +9,7 @@ from unit.fusion import se3_reference as reference
 
 from tcpipe.fusion import error_state, smoother_kernel, state
 from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
-from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Memory, TickInputs, allocate_steps, filter_ticks
+from tcpipe.fusion.filter_kernel import Memory, TickInputs, Verdict, allocate_steps, filter_ticks
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
 from tcpipe.fusion.smoother_kernel import (
@@ -23,11 +23,12 @@ from tcpipe.fusion.smoother_kernel import (
     step_before_motion,
     step_before_update,
 )
+from tcpipe.fusion.state import Error, Kind, Mode
 from tcpipe.fusion.ticks import Ticks
 
 T = 0.05
-MODES = (state.FLAT_TURN, state.VISUAL_TURN, state.GYRO_TURN, state.INERTIAL)
-FAULTY = range(state.GYRO_BIAS, state.N)
+MODES = (Mode.FLAT_TURN, Mode.VISUAL_TURN, Mode.GYRO_TURN, Mode.INERTIAL)
+FAULTY = range(Error.GYRO_BIAS, state.N)
 """Errors that may be known exactly."""
 seeds = st.integers(0, 2**32 - 1)
 subsets = st.sets(st.sampled_from(FAULTY))
@@ -38,7 +39,7 @@ def make_state(rng):
     x = 0.05 * rng.normal(size=state.NX)
     x[:9] = Rotation.random(rng=rng).as_matrix().ravel()
     x[9:12], x[12:15] = rng.normal(size=3), rng.normal(size=3)
-    x[state.ARM + 6 : state.ARM + 9] = rng.normal(size=3)
+    x[Error.ARM + 6 : Error.ARM + 9] = rng.normal(size=3)
     return x
 
 
@@ -47,13 +48,13 @@ def make_covariance(rng, size, std):
     return std**2 * root @ root.T
 
 
-def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
+def make_inputs(count, rng, mode=Mode.INERTIAL, *, noise=0.0, kept=1.0):
     """Return ticks of random motion without measurements."""
     turned, gained = np.zeros((count, 9)), np.zeros((count, 6))
     for k in range(count):
         turn = rng.normal(size=3) * T
         turned[k, :3] = turn
-        if mode >= state.GYRO_TURN:
+        if mode >= Mode.GYRO_TURN:
             turned[k] = Rotation.from_rotvec(turn).as_matrix().ravel()
         gained[k] = np.concatenate(
             ((rng.normal(size=3) + reference.G) * T, (rng.normal(size=3) + reference.G) * T**2 / 2)
@@ -66,7 +67,7 @@ def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
         gained,
         np.full((count, 6), noise),
         rng.normal(size=(count, 3)),
-        np.full(count, mode >= state.GYRO_TURN),
+        np.full(count, mode >= Mode.GYRO_TURN),
         rng.normal(size=count),
         np.full((*shape, 3), np.nan),
         np.ones((*shape, 3)),
@@ -80,7 +81,7 @@ def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
 
 def look_at(inputs, k, kind):
     acceleration = np.array([inputs.acceleration[k], 0.0, 0.0])
-    lever = inputs.attitude[k] if kind == state.ATTITUDE else inputs.levers[kind]
+    lever = inputs.attitude[k] if kind == Kind.ATTITUDE else inputs.levers[kind]
     return reference.Look(inputs.rate[k], bool(inputs.has_gyro[k]), acceleration, inputs.tau[k, kind], lever)
 
 
@@ -126,8 +127,8 @@ def test_motion_maps_small_errors_by_its_jacobian(mode, seed, free):
     F = wanted[np.ix_(model.active, model.active)]
     assert np.allclose(reference.minus(states[1], centre), 0.0, atol=1e-12)
     assert np.allclose(steps.P[1], F @ P @ F.T, atol=1e-12)
-    used = model.depends[state.KINDS + (mode >= state.GYRO_TURN)]
-    used = used[: model.counts[state.KINDS + (mode >= state.GYRO_TURN)]]
+    used = model.depends[state.KINDS + (mode >= Mode.GYRO_TURN)]
+    used = used[: model.counts[state.KINDS + (mode >= Mode.GYRO_TURN)]]
     assert np.allclose(steps.F[1][: used.size, : used.size], F[np.ix_(used, used)], atol=1e-6)
     others = np.delete(np.arange(model.active.size), used)
     assert np.allclose(F[:, others], np.eye(model.active.size)[:, others], atol=0.0)
@@ -152,7 +153,7 @@ def test_each_measurement_maps_small_errors_by_its_jacobian(kind, seed, free, mo
     memory = Memory(x.copy(), P.copy(), np.zeros((state.KINDS, 2)))
     steps, states = filter_all(inputs, model, memory)
     H = wanted[:, model.active]
-    assert np.allclose(steps.H[0, kind][:size], H, atol=2e-3 if kind >= state.DOPPLER else 5e-4)
+    assert np.allclose(steps.H[0, kind][:size], H, atol=2e-3 if kind >= Kind.DOPPLER else 5e-4)
     S = H @ P @ H.T + R
     K = P @ H.T @ np.linalg.inv(S)
     y = z - reference.expect(kind, x, look)
@@ -167,10 +168,10 @@ def test_each_measurement_maps_small_errors_by_its_jacobian(kind, seed, free, mo
 def test_a_wide_covariance_passes_as_a_cloud_does():
     """With 20 degrees of yaw and an antenna 2 m ahead a Jacobian says that fixes scatter sideways only, by 0.70 m."""
     rng = np.random.default_rng(3)
-    x, model, inputs = np.zeros(state.NX), model_of(()), make_inputs(1, rng, state.FLAT_TURN)
-    x[:9], x[state.ARM + 6] = np.eye(3).ravel(), 2.0
+    x, model, inputs = np.zeros(state.NX), model_of(()), make_inputs(1, rng, Mode.FLAT_TURN)
+    x[:9], x[Error.ARM + 6] = np.eye(3).ravel(), 2.0
     P = np.diag([1e-8, 1e-8, np.radians(20.0) ** 2, *[1e-8] * 6])
-    inputs.value[0, state.FIX], inputs.variance[0, state.FIX] = 0.0, 1e-4
+    inputs.value[0, Kind.FIX], inputs.variance[0, Kind.FIX] = 0.0, 1e-4
     inputs.tau[:], inputs.rate[:], inputs.acceleration[:] = 0.0, 0.0, 0.0
     tests, states = make_tests(1), np.zeros((1, state.NX))
     memory = Memory(x.copy(), P.copy(), np.zeros((state.KINDS, 2)))
@@ -178,7 +179,7 @@ def test_a_wide_covariance_passes_as_a_cloud_does():
     yaw = np.radians(20.0) * rng.normal(size=400_000)
     cloud = 2.0 * np.stack((np.cos(yaw) - 1.0, np.sin(yaw)), -1)
     second = cloud.T @ cloud / yaw.size + np.eye(2) * 1e-4
-    assert tests.log_det[0, state.FIX] == pytest.approx(np.log(np.linalg.det(second) * 1e-4), abs=0.15)
+    assert tests.log_det[0, Kind.FIX] == pytest.approx(np.log(np.linalg.det(second) * 1e-4), abs=0.15)
     assert second[0, 0] > 100 * 1e-4
 
 
@@ -190,9 +191,9 @@ class Problem:
 
     def __init__(self, seed, mode, ticks=48):
         rng = np.random.default_rng(seed)
-        free = {*FAULTY} - {*range(state.FIX_OFFSET, state.FIX_OFFSET + 3), state.SHARED_SCALE, state.VISUAL_SLIP}
-        free -= set() if mode >= state.GYRO_TURN else {*range(state.GYRO_BIAS, state.ARM)}
-        walking = {state.WHEEL_SCALE, state.VISUAL_SCALE} | ({*range(state.GYRO_BIAS, state.ARM)} & free)
+        free = {*FAULTY} - {*range(Error.FIX_OFFSET, Error.FIX_OFFSET + 3), Error.SHARED_SCALE, Error.VISUAL_SLIP}
+        free -= set() if mode >= Mode.GYRO_TURN else {*range(Error.GYRO_BIAS, Error.ARM)}
+        walking = {Error.WHEEL_SCALE, Error.VISUAL_SCALE} | ({*range(Error.GYRO_BIAS, Error.ARM)} & free)
         std, walk = np.zeros(state.N), np.zeros(state.N)
         std[sorted(free)], walk[sorted(walking)] = 0.01, 0.003
         self.inputs = make_inputs(ticks, rng, mode, noise=1e-6, kept=0.9)
@@ -202,9 +203,9 @@ class Problem:
         self.P = np.diag(np.square(np.concatenate((np.full(9, 0.01), std[self.model.active[9:]]))))
         self.x = np.zeros(state.NX)
         self.x[:9], self.x[12] = np.eye(3).ravel(), 1.0
-        self.x[state.ARM + 6 : state.ARM + 9] = 0.3, 0.1, 0.5
+        self.x[Error.ARM + 6 : Error.ARM + 9] = 0.3, 0.1, 0.5
         variance = self.model.noise.copy()
-        for places, added in ((range(3), 1e-6), (range(state.U, state.U + 3), 1e-6), (range(19, 22), 1e-6)):
+        for places, added in ((range(3), 1e-6), (range(Error.U, Error.U + 3), 1e-6), (range(19, 22), 1e-6)):
             variance[np.isin(self.model.active, places)] += added
         self.noisy = np.flatnonzero(variance)
         self.std = np.sqrt(variance[self.noisy])
@@ -212,7 +213,7 @@ class Problem:
         self.rows = []
         true, _ = self.play(rng.normal(size=self.free))
         for k in range(ticks):
-            for kind in set(range(state.KINDS)) - {state.STATIONARY, state.STATIONARY_RATE}:
+            for kind in set(range(state.KINDS)) - {Kind.STATIONARY, Kind.STATIONARY_RATE}:
                 if k % (2 + kind) == 0:
                     self.inputs.attitude[k] = Rotation.from_matrix(true[k][:9].reshape(3, 3)).as_rotvec()
                     size = state.SIZES[kind]
@@ -243,7 +244,7 @@ class Problem:
             tick = reference.Tick(int(self.inputs.mode[k]), T, self.inputs.turned[k], self.inputs.gained[k])
             F = reference.differentiate_motion(x, tick)[np.ix_(model.active, model.active)]
             x, G = reference.move(x, tick), F @ G
-            x[state.FIX_ERROR + 6 : state.FIX_ERROR + 9] *= 0.9
+            x[Error.FIX_ERROR + 6 : Error.FIX_ERROR + 9] *= 0.9
             G[np.isin(model.active, range(19, 22))] *= 0.9
             columns = n + (k - 1) * self.noisy.size + np.arange(self.noisy.size)
             x, G, J = self.step(x, self.std * free[columns], G, self.noisy)
@@ -293,9 +294,9 @@ def test_filter_and_smoother_solve_the_least_squares_problem_of_all_ticks(monkey
         position = R @ wanted[3:6, 3:6] @ R.T
         assert np.diag(position) == pytest.approx(found.variances[k, :3], rel=0.02)
         assert wanted[6, 6] == pytest.approx(found.variances[k, 4], rel=0.02)
-        mount = [list(active).index(e) for e in range(state.MOUNT, state.MOUNT + 3)]
+        mount = [list(active).index(e) for e in range(Error.MOUNT, Error.MOUNT + 3)]
         turned = maps[k][:3] + maps[k][mount]
-        robot = R @ (np.eye(3) + reference.skew(states[k][state.MOUNT + 6 : state.MOUNT + 9]))
+        robot = R @ (np.eye(3) + reference.skew(states[k][Error.MOUNT + 6 : Error.MOUNT + 9]))
 
         def compute_yaw(d, R=robot):
             ahead = R @ reference.exp(d)
@@ -340,8 +341,8 @@ def test_what_no_measurement_shows_keeps_its_prior_and_what_is_exact_stays(seed,
     exact = np.setdiff1d(FAULTY, model.active) + 6
     assert np.array_equal(states[:, exact], np.tile(x[exact], (30, 1)))
 
-    moves = model.depends[state.KINDS + (mode >= state.GYRO_TURN)][
-        : model.counts[state.KINDS + (mode >= state.GYRO_TURN)]
+    moves = model.depends[state.KINDS + (mode >= Mode.GYRO_TURN)][
+        : model.counts[state.KINDS + (mode >= Mode.GYRO_TURN)]
     ]
     shown = {*moves, *(i for kind in kinds for i in model.depends[kind][: model.counts[kind]])}
     hidden = sorted(set(range(n)) - shown)
@@ -353,9 +354,9 @@ def test_what_no_measurement_shows_keeps_its_prior_and_what_is_exact_stays(seed,
     assert np.array_equal(smoothed.states[:, places], np.tile(x[places], (30, 1)))
 
 
-@pytest.mark.parametrize("place", [state.WHEEL_SCALE, state.GYRO_BIAS, state.ARM])
+@pytest.mark.parametrize("place", [Error.WHEEL_SCALE, Error.GYRO_BIAS, Error.ARM])
 def test_evidence_of_an_event_is_what_it_gains_in_log_likelihood(place):
-    problem = Problem(11, state.INERTIAL)
+    problem = Problem(11, Mode.INERTIAL)
     size, std = problem.inputs.mode.size, 0.05
     entry = list(problem.model.active).index(place)
 
@@ -382,10 +383,10 @@ def test_evidence_of_an_event_is_what_it_gains_in_log_likelihood(place):
 
 def filter_stationary(kind, displace, noise):
     """Return tests and states of a stationary robot whose measurements of one kind ``displace`` changes."""
-    inputs, model = make_inputs(120, np.random.default_rng(4), state.FLAT_TURN, noise=noise), model_of(())
+    inputs, model = make_inputs(120, np.random.default_rng(4), Mode.FLAT_TURN, noise=noise), model_of(())
     model.gates[kind] = 16.27
     inputs.rate[:], inputs.turned[:], inputs.acceleration[:], inputs.tau[:] = 0.0, 0.0, 0.0, 0.0
-    inputs.value[:, state.STATIONARY], inputs.variance[:, state.STATIONARY] = 0.0, 1e-4
+    inputs.value[:, Kind.STATIONARY], inputs.variance[:, Kind.STATIONARY] = 0.0, 1e-4
     inputs.value[:, kind], inputs.variance[:, kind] = 0.0, 1e-4
     inputs.attitude[:] = 0.0
     displace(inputs)
@@ -400,15 +401,15 @@ def filter_stationary(kind, displace, noise):
 
 def test_rejections_in_a_row_open_the_gate_again():
     def move(inputs):
-        inputs.value[40:, state.FIX, 0] = 5.0
+        inputs.value[40:, Kind.FIX, 0] = 5.0
 
-    tests, states = filter_stationary(state.FIX, move, noise=1e-6)
-    assert (tests.verdict[:40, state.FIX] == ACCEPTED).all()
-    reset = int(np.flatnonzero(tests.verdict[:, state.FIX] == RESET)[0])
+    tests, states = filter_stationary(Kind.FIX, move, noise=1e-6)
+    assert (tests.verdict[:40, Kind.FIX] == Verdict.ACCEPTED).all()
+    reset = int(np.flatnonzero(tests.verdict[:, Kind.FIX] == Verdict.RESET)[0])
     assert reset * T == pytest.approx(39 * T + 2.0, abs=T)
-    assert (tests.verdict[40:reset, state.FIX] == REJECTED).all()
+    assert (tests.verdict[40:reset, Kind.FIX] == Verdict.REJECTED).all()
     assert np.abs(states[39:reset, 9]).max() < 0.01
-    assert (tests.verdict[reset + 1 :, state.FIX] == ACCEPTED).all()
+    assert (tests.verdict[reset + 1 :, Kind.FIX] == Verdict.ACCEPTED).all()
     assert states[-1, 9] == pytest.approx(5.0, abs=0.05)
 
 
@@ -416,10 +417,10 @@ def test_an_attitude_that_is_rejected_for_long_is_followed():
     def turn(inputs):
         inputs.attitude[40:, 2] = 1.0
 
-    tests, states = filter_stationary(state.ATTITUDE, turn, noise=1e-8)
-    reset = int(np.flatnonzero(tests.verdict[:, state.ATTITUDE] == RESET)[0])
+    tests, states = filter_stationary(Kind.ATTITUDE, turn, noise=1e-8)
+    reset = int(np.flatnonzero(tests.verdict[:, Kind.ATTITUDE] == Verdict.RESET)[0])
     assert reset * T == pytest.approx(39 * T + 2.0, abs=T)
-    assert (tests.verdict[reset + 1 :, state.ATTITUDE] == ACCEPTED).all()
+    assert (tests.verdict[reset + 1 :, Kind.ATTITUDE] == Verdict.ACCEPTED).all()
     assert np.arctan2(states[-1, 3], states[-1, 0]) == pytest.approx(1.0, abs=0.02)
 
 
@@ -427,26 +428,26 @@ def test_an_event_makes_an_error_uncertain_or_another_one():
     rng = np.random.default_rng(4)
     inputs = make_inputs(10, rng)
     std = np.zeros(state.N)
-    std[[state.WHEEL_SCALE, state.VISUAL_SCALE]] = 0.1
+    std[[Error.WHEEL_SCALE, Error.VISUAL_SCALE]] = 0.1
     events = (
-        Event(5, state.WHEEL_SCALE, 0.3, 0.2),
-        Event(7, state.VISUAL_SCALE, is_new=True),
-        *(Event(6, state.ARM + axis, 0.4) for axis in range(3)),
+        Event(5, Error.WHEEL_SCALE, 0.3, 0.2),
+        Event(7, Error.VISUAL_SCALE, is_new=True),
+        *(Event(6, Error.ARM + axis, 0.4) for axis in range(3)),
     )
     model = make_model(Measurements(), std, np.zeros(state.N), events, period_s=T, gate_probability=0.999)
     x, n = make_state(rng), model.active.size
     place = {e: i for i, e in enumerate(model.active)}
     P = np.diag(np.square(np.concatenate((np.full(9, 0.1), std[model.active[9:]]))))
-    P[place[state.VISUAL_SCALE], place[state.VISUAL_SCALE]] = 0.05**2  # known better than by its prior
+    P[place[Error.VISUAL_SCALE], place[Error.VISUAL_SCALE]] = 0.05**2  # known better than by its prior
     steps, states = filter_all(inputs, model, Memory(x.copy(), P, np.zeros((state.KINDS, 2))))
     spread = np.sqrt(np.array([np.diag(of) for of in steps.P]))
     assert n == 9 + 2 + 3
-    assert spread[4:6, place[state.WHEEL_SCALE]] == pytest.approx([0.1, np.hypot(0.1, 0.3)])
-    assert spread[6:8, place[state.VISUAL_SCALE]] == pytest.approx([0.05, 0.1])
-    assert spread[5:7, place[state.ARM]] == pytest.approx([0.0, 0.4])
-    assert states[6, state.VISUAL_SCALE + 6] == x[state.VISUAL_SCALE + 6]
-    assert states[7, state.VISUAL_SCALE + 6] == 0.0
-    assert states[9, state.WHEEL_SCALE + 6] == x[state.WHEEL_SCALE + 6] + 0.2
+    assert spread[4:6, place[Error.WHEEL_SCALE]] == pytest.approx([0.1, np.hypot(0.1, 0.3)])
+    assert spread[6:8, place[Error.VISUAL_SCALE]] == pytest.approx([0.05, 0.1])
+    assert spread[5:7, place[Error.ARM]] == pytest.approx([0.0, 0.4])
+    assert states[6, Error.VISUAL_SCALE + 6] == x[Error.VISUAL_SCALE + 6]
+    assert states[7, Error.VISUAL_SCALE + 6] == 0.0
+    assert states[9, Error.WHEEL_SCALE + 6] == x[Error.WHEEL_SCALE + 6] + 0.2
 
 
 def test_rounding_of_the_smoothers_information_does_not_grow():

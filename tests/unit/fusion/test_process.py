@@ -8,9 +8,9 @@ import pytest
 from unit.fusion import drive
 from unit.fusion.test_error_state import fuse, truth
 
-from tcpipe.fusion import state
 from tcpipe.fusion.preparation import inflate_jittery_fixes, prepare_imu
 from tcpipe.fusion.process import make_motion_noise, turn_scale_std
+from tcpipe.fusion.state import Mode
 
 
 @cache
@@ -36,12 +36,12 @@ def test_vibration_counts_where_it_is():
     imu, _ = prepare_imu(stamp_ns, columns, **place, gyro_std_radps=0.002, accelerometer_std_mps2=0.02)
     assert imu.accelerometer_noise_mps2[:1700] == pytest.approx(np.full(1700, 0.05), rel=0.3)
     assert imu.accelerometer_noise_mps2[2300:] == pytest.approx(np.full(1700, 0.4), rel=0.3)
-    density = estimate_density(replace(measured(), imu=imu), stamp_ns[[1000, 3000]], state.INERTIAL)
+    density = estimate_density(replace(measured(), imu=imu), stamp_ns[[1000, 3000]], Mode.INERTIAL)
     assert density == pytest.approx(np.array([0.05, 0.4]) ** 2 / 200, rel=0.6)
 
 
 def test_without_an_imu_the_velocity_may_change_where_every_odometry_says_so():
-    moving, held = measured(imu=False), state.FLAT_TURN
+    moving, held = measured(imu=False), Mode.FLAT_TURN
     at_ns = drive.ns([4.3, 30.0])  # starting, and driving steadily
     starting, steady = estimate_density(moving, at_ns, held)
     assert starting > 5 * steady

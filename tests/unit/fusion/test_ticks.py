@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
-from tcpipe.fusion import state
 from tcpipe.fusion.measurements import (
     WHEELS,
     BodyVelocities,
@@ -17,6 +16,7 @@ from tcpipe.fusion.measurements import (
     cut_sections,
     make_track_stamps,
 )
+from tcpipe.fusion.state import Kind, Mode
 from tcpipe.fusion.ticks import build_ticks, find_tick_period_ns
 
 NOWHERE = np.empty((0, 2), np.int64)
@@ -65,9 +65,9 @@ def test_each_tick_holds_the_mean_of_what_a_sensor_measures_around_it():
     noise = drive.estimate_noise(m)
     white = np.array([fix.white / fix.claimed_m2 for fix in (noise.horizontal, noise.horizontal, noise.vertical)])
     for kind, stamp_ns, values in (
-        (state.WHEELS, m.wheels.stamp_ns, m.wheels.velocity_mps[:, :1]),
-        (state.VISUAL, m.visual.stamp_ns, m.visual.velocity_mps),
-        (state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m),
+        (Kind.WHEELS, m.wheels.stamp_ns, m.wheels.velocity_mps[:, :1]),
+        (Kind.VISUAL, m.visual.stamp_ns, m.visual.velocity_mps),
+        (Kind.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m),
     ):
         width = values.shape[1]
         told = np.flatnonzero(np.isfinite(found.inputs.value[:, kind, 0]))
@@ -77,10 +77,10 @@ def test_each_tick_holds_the_mean_of_what_a_sensor_measures_around_it():
             late_s = (stamp_ns[near] - found.stamp_ns[k]).mean() * 1e-9
             assert found.inputs.tau[k, kind] == pytest.approx(late_s, abs=1e-12)
             assert (found.rows[kind][near] == k).all()
-            if kind == state.FIX:
+            if kind == Kind.FIX:
                 assert found.inputs.variance[k, kind] == pytest.approx(m.gnss.variance_m2[0] * white / near.sum())
         assert set(told) == set(found.rows[kind][found.rows[kind] >= 0])
-    assert np.isnan(found.inputs.value[:, [state.LEVEL, state.DOPPLER, state.STATIONARY]]).all()
+    assert np.isnan(found.inputs.value[:, [Kind.LEVEL, Kind.DOPPLER, Kind.STATIONARY]]).all()
 
 
 @pytest.mark.parametrize("hz", [1.0, 100.0])
@@ -89,11 +89,11 @@ def test_a_sensor_of_any_rate_carries_the_information_that_it_claims(hz):
     stamp_ns = drive.ns(np.arange(0.2, 29.0, 1.0 / hz))
     slow = Measurements(gnss=fixes(stamp_ns), imu=m.imu, wheels=m.wheels)
     found = ticks_of(slow, int(drive.ns(0.1)), int(drive.ns(29.5)))
-    told = np.isfinite(found.inputs.value[:, state.FIX, 0])
+    told = np.isfinite(found.inputs.value[:, Kind.FIX, 0])
     assert told.sum() == pytest.approx(min(hz, 20.0) * 28.8, rel=0.02)
     noise = drive.estimate_noise(slow)
     white_m2 = noise.horizontal.white / noise.horizontal.claimed_m2
-    assert np.sum(1.0 / found.inputs.variance[told, state.FIX, 0]) == pytest.approx(stamp_ns.size / white_m2, rel=0.02)
+    assert np.sum(1.0 / found.inputs.variance[told, Kind.FIX, 0]) == pytest.approx(stamp_ns.size / white_m2, rel=0.02)
 
 
 @pytest.mark.parametrize("hz", [4.0, 20.0, 100.0])
@@ -109,8 +109,8 @@ def test_wheels_of_any_rate_carry_the_information_of_their_noise_density(hz):
     found = build_ticks(
         replace(m, wheels=source), noise, NOWHERE, int(output_ns[0]), int(output_ns[-1]), output_ns=output_ns
     )
-    used = np.isfinite(found.inputs.value[:, state.WHEELS, 0])
-    per_second = np.sum(1.0 / found.inputs.variance[used, state.WHEELS, 0]) / (stamp_ns.size / hz)
+    used = np.isfinite(found.inputs.value[:, Kind.WHEELS, 0])
+    per_second = np.sum(1.0 / found.inputs.variance[used, Kind.WHEELS, 0]) / (stamp_ns.size / hz)
     assert per_second == pytest.approx(1.0 / density, rel=1e-3)
 
 
@@ -141,7 +141,7 @@ def test_preintegration_is_a_fine_integration(hz, turn_rad, moved_m):
     for k in (5, 12, 30):
         end_s = (found.stamp_ns[k] - drive.ZERO_NS) * 1e-9
         turn, velocity, moved = integrate_finely(imu, end_s - 0.05, end_s, 2_000)
-        assert found.inputs.mode[k] == state.INERTIAL
+        assert found.inputs.mode[k] == Mode.INERTIAL
         off = (turn.inv() * Rotation.from_matrix(found.inputs.turned[k].reshape(3, 3))).magnitude()
         assert off < turn_rad
         assert found.inputs.gained[k, :3] == pytest.approx(velocity, abs=20 * moved_m)
@@ -153,8 +153,8 @@ def test_a_gap_of_the_imu_changes_the_motion_there_only():
     holed = stamp[(stamp <= 1_000_000_000) | (stamp >= 1_500_000_000)]
     found = ticks_of(Measurements(gnss=fixes(stamp[::10]), imu=ramp_imu(holed)), 100_000_000, 2_900_000_000)
     hole = (found.stamp_ns > 1_000_000_000) & (found.stamp_ns - TICK_NS < 1_500_000_000)
-    assert (found.inputs.mode[hole] == state.FLAT_TURN).all()
-    assert (found.inputs.mode[1:][~hole[1:]] == state.INERTIAL).all()
+    assert (found.inputs.mode[hole] == Mode.FLAT_TURN).all()
+    assert (found.inputs.mode[1:][~hole[1:]] == Mode.INERTIAL).all()
     assert not found.inputs.has_gyro[hole][1:-1].any()
     assert found.inputs.has_gyro[(found.stamp_ns < 950_000_000) | (found.stamp_ns > 1_550_000_000)][1:].all()
     # The rate at a tick is the mean around it: of a ramp, its value.
@@ -167,7 +167,7 @@ def test_the_constraint_carries_the_same_information_at_any_length_of_ticks():
     start_ns, end_ns = int(drive.ns(1.0)), int(drive.ns(19.0))
     for period_ns in (50_000_000, 20_000_000):
         found = ticks_of(m, start_ns, end_ns, period_ns=period_ns)
-        told = np.sum(1.0 / found.inputs.variance[:, state.SIDEWAYS, 0]) / 18.0
+        told = np.sum(1.0 / found.inputs.variance[:, Kind.SIDEWAYS, 0]) / 18.0
         assert told == pytest.approx(62.5 / m.nonholonomic_std_mps**2, rel=0.02)
 
 
@@ -175,24 +175,24 @@ def test_a_stop_measures_velocity_and_bias_five_times_a_second():
     stamp = np.arange(0, 3_000_000_000, 10_000_000, dtype=np.int64)
     m = Measurements(gnss=fixes(stamp[::10]), imu=ramp_imu(stamp))
     found = ticks_of(m, 100_000_000, 2_900_000_000, np.array([[1_000_000_000, 2_000_000_000]], np.int64))
-    stopped = np.flatnonzero(np.isfinite(found.inputs.value[:, state.STATIONARY, 0]))
+    stopped = np.flatnonzero(np.isfinite(found.inputs.value[:, Kind.STATIONARY, 0]))
     assert stopped.size == 5
-    assert (found.inputs.value[stopped, state.STATIONARY] == 0.0).all()
+    assert (found.inputs.value[stopped, Kind.STATIONARY] == 0.0).all()
     stamp_s = found.stamp_ns[stopped] * 1e-9
     assert (stamp_s >= 1.0).all()
     assert (stamp_s < 2.0).all()
-    assert found.inputs.value[stopped, state.STATIONARY_RATE, 2] == pytest.approx(stamp_s, abs=1e-9)
+    assert found.inputs.value[stopped, Kind.STATIONARY_RATE, 2] == pytest.approx(stamp_s, abs=1e-9)
 
 
 def test_without_an_accelerometer_the_robot_is_about_level_and_the_odometry_turns_it():
     truth = drive.make_drive(20.0)
     found = ticks_of(drive.measure(truth, 6, imu=False), int(drive.ns(1.0)), int(drive.ns(19.0)))
-    level = np.isfinite(found.inputs.value[:, state.LEVEL, 0])
+    level = np.isfinite(found.inputs.value[:, Kind.LEVEL, 0])
     assert level.sum() == pytest.approx(19, abs=1)
     t = (found.stamp_ns - drive.ZERO_NS) * 1e-9
     true = 0.8 * np.interp(t, truth.t, truth.rate[:, 2])  # these wheels turn less than they say
     assert np.sqrt(np.mean((found.inputs.rate[:, 2] - true) ** 2)) < 0.03
-    assert (found.inputs.mode < state.GYRO_TURN).all()
+    assert (found.inputs.mode < Mode.GYRO_TURN).all()
 
 
 def test_an_outage_leaves_ticks_without_fixes_and_a_claim_that_grows_adds_to_their_error():
@@ -200,7 +200,7 @@ def test_an_outage_leaves_ticks_without_fixes_and_a_claim_that_grows_adds_to_the
     worse = np.where((m.gnss.stamp_ns > drive.ns(50.0))[:, None], 9.0, 1.0) * m.gnss.variance_m2
     found = ticks_of(replace(m, gnss=replace(m.gnss, variance_m2=worse)), int(drive.ns(1.0)), int(drive.ns(58.0)))
     t = (found.stamp_ns - drive.ZERO_NS) * 1e-9
-    assert np.isnan(found.inputs.value[(t > 20.1) & (t < 39.9), state.FIX]).all()
+    assert np.isnan(found.inputs.value[(t > 20.1) & (t < 39.9), Kind.FIX]).all()
     # By the recursion alone the correlated error has the variance that fixes claim there, in the outage as well.
     variance = found.fix_variance_m2[0].copy()
     for k in range(1, t.size):

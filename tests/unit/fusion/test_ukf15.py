@@ -15,6 +15,7 @@ from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import make_model, make_priors, make_start
 from tcpipe.fusion.smoother_kernel import SELDOM
+from tcpipe.fusion.state import Error
 from tcpipe.fusion.ticks import build_ticks
 from tcpipe.fusion.ukf15 import filter_forward, run_ukf15
 from tcpipe.geometry.rotation import invert, rotate, rpy_from_matrix, rpy_from_quat, wrap_to_pi
@@ -148,7 +149,7 @@ def test_a_lasting_offset_of_the_fixes_is_followed_after_five_seconds(truth):
 def test_a_covariance_that_rounding_has_made_useless_keeps_its_variances(truth):
     """A correlation of two between forward and sideways velocity."""
     ticks, model, start = _prepare(truth, measured(truth, 1), initial(truth))
-    start.P[state.U, state.U + 1] = start.P[state.U + 1, state.U] = 2.0 * start.P[state.U, state.U]
+    start.P[Error.U, Error.U + 1] = start.P[Error.U + 1, Error.U] = 2.0 * start.P[Error.U, Error.U]
     forward, estimate = filter_forward(ticks, model, start)
     assert np.isfinite(forward.states).all()
     assert (estimate.variances > 0.0).all()
