@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import NoiseModel
-from tcpipe.fusion.filter_kernel import Tests, Verdict
+from tcpipe.fusion.filter_kernel import GateVerdict, Tests
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, Residuals
 from tcpipe.fusion.parameters import FIX_AXES, Event
@@ -191,8 +191,8 @@ def is_contradicted(tests: Tests, period_s: float) -> bool:
     """Return whether a sensor is rejected more often, or longer without a break, than one that is not wrong."""
     most = read_threshold("measurements-rejected", "max_rejected_fraction")
     for kind in _REJECTED_S:
-        rows = np.flatnonzero(tests.verdict[:, kind] != Verdict.NONE)
-        rejected = tests.verdict[rows, kind] != Verdict.ACCEPTED
+        rows = np.flatnonzero(tests.verdict[:, kind] != GateVerdict.NONE)
+        rejected = tests.verdict[rows, kind] != GateVerdict.ACCEPTED
         if rejected.sum() > most * rows.size or _find_long_runs(rows, rejected, period_s, kind):
             return True
     return False
@@ -210,7 +210,7 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
         if rows.size:
             series = tests.fix_innovation[rows] if kind == Kind.FIX else value[rows, kind, axes]
             is_spike = _find_spikes(series, np.sqrt(ticks.inputs.variance[rows, kind, axes]))
-            rejected = tests.verdict[rows, kind] != Verdict.ACCEPTED
+            rejected = tests.verdict[rows, kind] != GateVerdict.ACCEPTED
             for first, last in _find_long_runs(rows, rejected, ticks.inputs.period_s, kind):
                 rejected[first:last] = False
             value[rows[is_spike | rejected], kind] = np.nan

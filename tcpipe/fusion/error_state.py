@@ -34,9 +34,9 @@ from tcpipe.fusion.dead_reckoning import compute_course
 from tcpipe.fusion.densities import PRIORS, NoiseModel, fit_noise, inflate_unclaimed_fixes
 from tcpipe.fusion.filter_kernel import (
     FilterModel,
+    GateVerdict,
     Memory,
     Tests,
-    Verdict,
     allocate_steps,
     filter_ticks,
 )
@@ -472,7 +472,7 @@ def _list_rows(m: Measurements, made: Pass) -> Mapping[int, tuple[Ints, Ints]]:
 def _make_rejections(m: Measurements, made: Pass) -> Rejections:
     parts = []
     for kind, (stamp_ns, tick) in _list_rows(m, made).items():
-        refused = made.tests.verdict[tick, kind] == Verdict.REJECTED
+        refused = made.tests.verdict[tick, kind] == GateVerdict.REJECTED
         parts.append((stamp_ns[refused], np.full(int(refused.sum()), ROLES[kind]), made.tests.nis[tick[refused], kind],
                       np.full(int(refused.sum()), made.model.gates[kind])))  # fmt: skip
     stamp_ns, role, nis, gate = (np.concatenate(values) for values in zip(*parts, strict=True))
@@ -485,10 +485,12 @@ def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     found = []
     for kind, role in ((kind, role) for kind, role in ROLES.items() if kind != Kind.ATTITUDE):
         verdict, stamp_ns = made.tests.verdict[:, kind], made.ticks.stamp_ns
-        for tick in np.flatnonzero(verdict == Verdict.RESET):
-            heard = np.flatnonzero((verdict[:tick] != Verdict.REJECTED) & (verdict[:tick] != Verdict.NONE))
+        for tick in np.flatnonzero(verdict == GateVerdict.RESET):
+            heard = np.flatnonzero((verdict[:tick] != GateVerdict.REJECTED) & (verdict[:tick] != GateVerdict.NONE))
             since = (
-                np.flatnonzero(verdict[heard[-1] + 1 : tick] == Verdict.REJECTED) + heard[-1] + 1 if heard.size else []
+                np.flatnonzero(verdict[heard[-1] + 1 : tick] == GateVerdict.REJECTED) + heard[-1] + 1
+                if heard.size
+                else []
             )
             first = since[0] if len(since) else tick
             off = made.tests.fix_innovation[tick, :2]
@@ -520,13 +522,13 @@ def _make_facts(  # noqa: PLR0917
     nis, verdicts = {}, {}
     for role in dict.fromkeys(ROLES[kind] for kind in rows):
         kinds = [kind for kind in rows if ROLES[kind] == role]
-        taken = np.concatenate([tests.nis[tests.verdict[:, kind] == Verdict.ACCEPTED, kind] for kind in kinds])
+        taken = np.concatenate([tests.nis[tests.verdict[:, kind] == GateVerdict.ACCEPTED, kind] for kind in kinds])
         nis[role] = float(taken.mean()) / state.SIZES[kinds[0]] if taken.size else None
         verdicts[role] = np.concatenate([tests.verdict[rows[kind][1], kind] for kind in kinds])
     return StretchFacts(
         nis_mean=nis,
         measurements={role: int(verdict.size) for role, verdict in verdicts.items()},
-        rejected={role: int((verdict == Verdict.REJECTED).sum()) for role, verdict in verdicts.items()},
+        rejected={role: int((verdict == GateVerdict.REJECTED).sum()) for role, verdict in verdicts.items()},
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, smoothed, explained)),
         common_scale_std=scale_std,

@@ -38,7 +38,7 @@ from tcpipe.fusion.state import (
 )
 
 
-class Verdict(IntEnum):
+class GateVerdict(IntEnum):
     """Verdicts of the gate. RESET: rejected for so long that the state is taken to be wrong, not the sensor."""
 
     NONE, ACCEPTED, REJECTED, RESET = range(4)
@@ -509,22 +509,22 @@ def filter_ticks(
             nis = _compute_nis(y, inverse, size)
             tests.nis[k, kind] = nis
             tests.log_det[k, kind] = log_det
-            verdict = Verdict.ACCEPTED
+            verdict = GateVerdict.ACCEPTED
             if kind == Kind.FIX:
                 tests.fix_innovation[k] = y
             if not nis <= model.gates[kind]:
-                verdict = Verdict.REJECTED
+                verdict = GateVerdict.REJECTED
                 waits[kind, 0] += 1.0
                 is_alone = True
                 for other in (Kind.WHEELS, Kind.VISUAL, Kind.FIX):
                     is_alone = is_alone and (other == kind or waits[other, 1] > 2.0)  # s
                 patience_s = model.patience[kind, 2 if is_alone else 1]
                 if waits[kind, 0] >= model.patience[kind, 0] and waits[kind, 1] >= patience_s:
-                    verdict = Verdict.RESET
+                    verdict = GateVerdict.RESET
                     _widen(kind, P, y, size, -1 if is_alone else model.scales[kind])
                     _compare(k, kind, inputs, model, x, P, acceleration, gain, room)
             tests.verdict[k, kind] = verdict
-            if verdict == Verdict.REJECTED:
+            if verdict == GateVerdict.REJECTED:
                 continue
             waits[kind, 0] = 0.0
             waits[kind, 1] = 0.0

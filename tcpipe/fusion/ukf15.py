@@ -20,7 +20,7 @@ from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
 from tcpipe.fusion.changes import Hypothesis
 from tcpipe.fusion.error_state import make_tests, make_trajectory, prepare_section
-from tcpipe.fusion.filter_kernel import FilterModel, Memory, Verdict
+from tcpipe.fusion.filter_kernel import FilterModel, GateVerdict, Memory
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S, InitialState, Measurements, Trajectory
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed
 from tcpipe.fusion.state import Error, Kind
@@ -72,17 +72,17 @@ def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pas
         if k > 0:
             ukf.predict(k)
         for kind in np.flatnonzero(np.isfinite(ticks.inputs.value[k, :, 0])).tolist():
-            verdict, innovation, nis = Verdict.ACCEPTED, *ukf.update(k, kind, model.gates[kind])
+            verdict, innovation, nis = GateVerdict.ACCEPTED, *ukf.update(k, kind, model.gates[kind])
             if kind == Kind.FIX:
                 tests.fix_innovation[k] = innovation
             if not nis <= model.gates[kind]:
-                verdict, since = Verdict.REJECTED, rejected[kind]
+                verdict, since = GateVerdict.REJECTED, rejected[kind]
                 since.append(k)
                 if len(since) >= 5 and (k - since[0]) * period_s >= 5.0:
-                    verdict = Verdict.RESET
+                    verdict = GateVerdict.RESET
                     ukf.inflate(kind, innovation)
                     ukf.update(k, kind, np.inf)
-            if verdict != Verdict.REJECTED:
+            if verdict != GateVerdict.REJECTED:
                 rejected[kind].clear()
             tests.nis[k, kind], tests.verdict[k, kind] = nis, verdict
         states[k], variances[k] = ukf.x, ukf.compute_variances()

@@ -10,7 +10,7 @@ from unit.fusion.test_error_state import fuse, smoothed, truth
 from tcpipe.fusion import state
 from tcpipe.fusion.changes import Change, Hypothesis, compute_evidence, is_contradicted, join_events
 from tcpipe.fusion.error_state import make_tests
-from tcpipe.fusion.filter_kernel import Verdict
+from tcpipe.fusion.filter_kernel import GateVerdict
 from tcpipe.fusion.state import Error, Kind
 
 
@@ -168,10 +168,10 @@ def test_nothing_happened_in_a_clean_run():
 
 def test_sensors_contradict_each_other_where_one_is_rejected_five_times_in_a_row_for_a_second():
     tests = make_tests(400)
-    tests.verdict[::2, Kind.FIX] = Verdict.ACCEPTED
-    tests.verdict[200:216:2, Kind.FIX] = Verdict.REJECTED
+    tests.verdict[::2, Kind.FIX] = GateVerdict.ACCEPTED
+    tests.verdict[200:216:2, Kind.FIX] = GateVerdict.REJECTED
     assert not is_contradicted(tests, 0.05)
-    tests.verdict[100:140:2, Kind.FIX] = Verdict.REJECTED
+    tests.verdict[100:140:2, Kind.FIX] = GateVerdict.REJECTED
     assert is_contradicted(tests, 0.05)
 
 

@@ -9,7 +9,7 @@ from unit.fusion import se3_reference as reference
 
 from tcpipe.fusion import error_state, smoother_kernel, state
 from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
-from tcpipe.fusion.filter_kernel import Memory, TickInputs, Verdict, allocate_steps, filter_ticks
+from tcpipe.fusion.filter_kernel import GateVerdict, Memory, TickInputs, allocate_steps, filter_ticks
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
 from tcpipe.fusion.smoother_kernel import (
@@ -404,12 +404,12 @@ def test_rejections_in_a_row_open_the_gate_again():
         inputs.value[40:, Kind.FIX, 0] = 5.0
 
     tests, states = filter_stationary(Kind.FIX, move, noise=1e-6)
-    assert (tests.verdict[:40, Kind.FIX] == Verdict.ACCEPTED).all()
-    reset = int(np.flatnonzero(tests.verdict[:, Kind.FIX] == Verdict.RESET)[0])
+    assert (tests.verdict[:40, Kind.FIX] == GateVerdict.ACCEPTED).all()
+    reset = int(np.flatnonzero(tests.verdict[:, Kind.FIX] == GateVerdict.RESET)[0])
     assert reset * T == pytest.approx(39 * T + 2.0, abs=T)
-    assert (tests.verdict[40:reset, Kind.FIX] == Verdict.REJECTED).all()
+    assert (tests.verdict[40:reset, Kind.FIX] == GateVerdict.REJECTED).all()
     assert np.abs(states[39:reset, 9]).max() < 0.01
-    assert (tests.verdict[reset + 1 :, Kind.FIX] == Verdict.ACCEPTED).all()
+    assert (tests.verdict[reset + 1 :, Kind.FIX] == GateVerdict.ACCEPTED).all()
     assert states[-1, 9] == pytest.approx(5.0, abs=0.05)
 
 
@@ -418,9 +418,9 @@ def test_an_attitude_that_is_rejected_for_long_is_followed():
         inputs.attitude[40:, 2] = 1.0
 
     tests, states = filter_stationary(Kind.ATTITUDE, turn, noise=1e-8)
-    reset = int(np.flatnonzero(tests.verdict[:, Kind.ATTITUDE] == Verdict.RESET)[0])
+    reset = int(np.flatnonzero(tests.verdict[:, Kind.ATTITUDE] == GateVerdict.RESET)[0])
     assert reset * T == pytest.approx(39 * T + 2.0, abs=T)
-    assert (tests.verdict[reset + 1 :, Kind.ATTITUDE] == Verdict.ACCEPTED).all()
+    assert (tests.verdict[reset + 1 :, Kind.ATTITUDE] == GateVerdict.ACCEPTED).all()
     assert np.arctan2(states[-1, 3], states[-1, 0]) == pytest.approx(1.0, abs=0.02)
 
 
