@@ -296,7 +296,7 @@ def _draw_track(axes: tuple[str, str], xy_m: Floats, legend: Mapping[str, str]) 
 def _draw_pictures(source: MapFile) -> Pictures:
     layers = source.layers
     draw: dict[str, Callable[[MapFile], NDArray[np.uint8]]] = {}
-    if any(name.startswith("ortho") for name in layers):
+    if "ortho" in layers:
         draw["orthophoto"] = draw_ortho
     draw["hillshade"] = draw_relief
     if "terrain" in layers:

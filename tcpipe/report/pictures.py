@@ -20,7 +20,7 @@ from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import PatchFiles, find_places_in_files, open_patches
 from tcpipe.formats.json_files import Json
-from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.maps.map_files import PICTURE_PX, MapFile
 from tcpipe.report.colours import choose_class_colours
 from tcpipe.tables.columns import to_floats
 from tcpipe.terrain.layers import COLOURS, MAX_ID, ClassTable, Pixels
@@ -84,17 +84,6 @@ def colour_heights(values: NDArray[np.float64]) -> Bytes:
     return np.where(known[..., None], colours, 255.0).astype(np.uint8)
 
 
-_SIDE_PX = 900
-
-
-def map_overview(source: MapFile) -> NDArray[np.uint8]:
-    """Return the orthophoto, or a shaded relief without one, as grey bytes of at most `_SIDE_PX` a side; the map is read in strips."""
-    level, step = _level(source)
-    layer = "ortho" if "ortho" in level.layers else "height"
-    picture = _thin_layer(level, layer, step)
-    return picture.astype(np.uint8) if layer == "ortho" else shade_heights(picture, step * level.grid.pixel_size_m)
-
-
 Bounds = tuple[float, float, float, float]
 """x_min, y_min, x_max, y_max [m]."""
 
@@ -111,17 +100,19 @@ def compute_joint_bounds_m(places: Sequence[tuple[str, Bounds]]) -> Bounds:
 
 
 def draw_ortho(source: MapFile) -> NDArray[np.uint8]:
-    """Return the orthophoto in colour, shape (R, C, 3), where the map has it so; else the `map_overview`."""
-    level, step = _level(source)
-    if not set(COLOURS) <= set(level.layers):
-        return map_overview(source)
-    return np.stack([_thin_layer(level, layer, step) for layer in COLOURS], axis=-1).astype(np.uint8)
+    """Return the orthophoto, in colour (R, C, 3) or grey (R, C), no data in white; a shaded relief without one."""
+    if (picture := source.read_picture()) is not None:
+        return picture
+    if "ortho" not in source.layers:
+        return draw_relief(source)
+    grey = _thin_layer(*_level(source), "ortho")
+    return np.where(grey, grey, 255).astype(np.uint8)
 
 
 def draw_relief(source: MapFile) -> NDArray[np.uint8]:
     """Return a shaded relief, shape (R, C)."""
     level, step = _level(source)
-    return shade_heights(_thin_layer(level, "height", step), step * level.grid.pixel_size_m)
+    return shade_heights(_thin_layer(level, step, "height"), step * level.grid.pixel_size_m)
 
 
 def draw_classes(source: MapFile) -> NDArray[np.uint8]:
@@ -129,7 +120,7 @@ def draw_classes(source: MapFile) -> NDArray[np.uint8]:
     level, step = _level(source)
     if "terrain" not in level.layers:
         return np.full((*draw_relief(source).shape, 3), 255, np.uint8)
-    return colour_classes(_thin_layer(level, "terrain", step), level.layers["terrain"].classes)
+    return colour_classes(_thin_layer(level, step, "terrain"), level.layers["terrain"].classes)
 
 
 def draw_maps(
@@ -142,7 +133,7 @@ def draw_maps(
     x_min_m, y_min_m, x_max_m, y_max_m = compute_joint_bounds_m(
         [(source.grid.crs, source.grid.bounds_m) for source in sources]
     )
-    step_m = max(x_max_m - x_min_m, y_max_m - y_min_m) / _SIDE_PX
+    step_m = max(x_max_m - x_min_m, y_max_m - y_min_m) / PICTURE_PX
     x_m, y_m = np.meshgrid(
         np.arange(x_min_m + step_m / 2, x_max_m, step_m), np.arange(y_max_m - step_m / 2, y_min_m, -step_m)
     )
@@ -162,11 +153,11 @@ def draw_maps(
 def _level(source: MapFile) -> tuple[MapFile, int]:
     """Return the coarsest level that is still large enough, and which of its pixels to take."""
     longer = max(source.grid.rows, source.grid.cols)
-    factor = max(factor for factor in source.factors if factor == 1 or longer // factor >= _SIDE_PX)
-    return source.at(factor), max(1, -(-(longer // factor) // _SIDE_PX))
+    factor = max(factor for factor in source.factors if factor == 1 or longer // factor >= PICTURE_PX)
+    return source.at(factor), max(1, -(-(longer // factor) // PICTURE_PX))
 
 
-def _thin_layer(level: MapFile, layer: str, step: int) -> Pixels:
+def _thin_layer(level: MapFile, step: int, layer: str) -> Pixels:
     """Return every ``step``-th pixel of a layer."""
     side = max(step, level.tile_px * 4 // step * step)
     rows, cols = level.grid.rows, level.grid.cols

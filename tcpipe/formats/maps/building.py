@@ -17,15 +17,22 @@ from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_directory
 from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.integrity import write_checksums
-from tcpipe.formats.maps.geotiff import USES, OpenFile, Use, keep_open
-from tcpipe.formats.maps.layer_building import Raster, RasterLayer, Tally, iterate_shards, open_raster
+from tcpipe.formats.maps.geotiff import USES, OpenFile, keep_open
+from tcpipe.formats.maps.layer_building import (
+    Raster,
+    RasterLayer,
+    Tally,
+    draw_colours,
+    iterate_shards,
+    open_raster,
+    split_colours,
+)
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
-from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
+from tcpipe.formats.maps.map_files import PICTURE_PX, SHARD_PX, MapWriter
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.layers import (
-    COLOURS,
     MAX_ID,
     PAPER_LAYERS,
     PAPER_SCHEME,
@@ -56,8 +63,6 @@ LayerSource = RasterLayer | PolygonLayer
 """Source of a layer of a map."""
 
 OrthoBands = Literal["grey", "rgb"]
-
-_RGB: tuple[Use, ...] = ("red", "green", "blue")
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +131,9 @@ def build_map(
                 _write(writer, source)
             _refuse_empty(sources)
             facts = _make_facts(grid, sources, origin, inputs or MapInputs())
+            photo = sources.get("ortho")
+            if isinstance(photo, RasterLayer) and (picture := draw_colours(photo, PICTURE_PX)) is not None:
+                writer.write_picture(picture)
             writer.finish(facts, {role: _set_range(source) for role, source in sources.items()})
             write_checksums(half)
     return facts
@@ -205,17 +213,16 @@ def _open_all(
     rasters: dict[str, Raster] = {}
     problems: list[str] = []
     uses = USES | {name: "classes" if name in more.categorical else "numbers" for name in more.files}
-    if more.ortho_bands == "rgb":
-        paths = {**paths, **dict.fromkeys(COLOURS, paths["ortho"])}
-        uses |= dict(zip(COLOURS, _RGB, strict=True))
     for role, files in paths.items():
         try:
             rasters[role] = open_raster(files, role, uses[role], open_file, crs)
         except MapError as error:
             problems += error.problems
+    if more.ortho_bands == "rgb" and (ortho := rasters.get("ortho")) and not (colours := split_colours(ortho)):
+        problems.append(f"{ortho.georeference.name}: has no colours, expected red, green, blue for --ortho-bands rgb")
     if problems:
-        raise MapError(*dict.fromkeys(problems))
-    return rasters
+        raise MapError(*problems)
+    return rasters | (colours if more.ortho_bands == "rgb" else {})
 
 
 def _refuse_empty(layers: Mapping[str, LayerSource]) -> None:

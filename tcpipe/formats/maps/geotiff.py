@@ -46,7 +46,10 @@ Use = Literal["metres", "grey", "red", "green", "blue", "classes", "numbers"]
 """Content of a raster: heights, an orthophoto or one of its colours, class values, or numbers in a unit of their own."""
 
 USES: dict[str, Use] = {"height": "metres", "ortho": "grey", "terrain": "classes"}
-"""Use by role; a colour's role is its layer."""
+"""Use by role."""
+
+COLOUR_USES: dict[str, Use] = {"ortho_red": "red", "ortho_green": "green", "ortho_blue": "blue"}
+"""Use of an orthophoto by the layer of its colour."""
 
 _WEIGHTS = {"grey": LUMA_RGB, "red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0)}
 """Weights of red, green and blue, by use."""
@@ -58,7 +61,7 @@ _METRES |= dict.fromkeys(("usft", "ftus", "footus", "usfoot", "ussft", "surveyfo
 """Metres by the name of a unit, of letters only."""
 
 GDAL_CONFIG = {
-    "GDAL_CACHEMAX": 256,  # [MB] decoded blocks: a strip of a wide raster is wanted by many windows
+    "GDAL_CACHEMAX": 256_000_000,  # [byte] decoded blocks: many windows need a strip of a wide raster
     "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",  # what lies beside is asked for by name, as `_refuse_beside` does
     "GDAL_VRT_ENABLE_PYTHON": "NO",
     "GDAL_PAM_ENABLED": "YES",
@@ -157,17 +160,18 @@ def keep_open() -> Iterator[OpenFile]:
 
 
 def read_window(  # noqa: PLR0917
-    open_file: OpenFile, tile: Tile, row0: int, row1: int, col0: int, col1: int
+    open_file: OpenFile, tile: Tile, row0: int, row1: int, col0: int, col1: int, shape: tuple[int, int] | None = None
 ) -> tuple[NDArray[Any], Mask]:
     """Return a window inside a tile, and which of its pixels have data; `MapError`: they are damaged, or the file is gone.
 
-    Values are float64 metres or numbers, float64 grey or colour from 0 to 255, or raw integers of classes.
+    Values are float64 metres or numbers, float64 grey or colour from 0 to 255, or raw integers of classes. If the ``shape`` is smaller
+    than the window, GDAL takes the nearest pixels, from the file's overviews if it has any.
     """
     window = Window(col0, row0, col1 - col0, row1 - row0)
     dataset = open_file(tile.path, tile.driver)
     try:
-        raw = dataset.read(tile.bands, window=window)
-        mask = dataset.dataset_mask(window=window)
+        raw = dataset.read(tile.bands, window=window, out_shape=shape and (len(tile.bands), *shape))
+        mask = dataset.dataset_mask(window=window, out_shape=shape)
     except RasterioError as error:
         raise MapError(
             f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: "
@@ -373,7 +377,7 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
     plain = [band for band, colour in enumerate(dataset.colorinterp, 1) if colour != ColorInterp.alpha]
     names = ", ".join(colour.name for colour in dataset.colorinterp)
     kinds = {np.dtype(dataset.dtypes[band - 1]) for band in plain}
-    if use in _WEIGHTS:
+    if use == "grey":
         rgb = [colours.get(colour) for colour in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
         palette = dataset.colorinterp[0] == ColorInterp.palette
         if not palette and any(kind not in {np.dtype(np.uint8), np.dtype(np.uint16)} for kind in kinds):
@@ -382,12 +386,13 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         if None not in rgb:
             more = make_finding("ortho-bands-unused", subject, names={**file, "bands": names})
             return tuple(band for band in rgb if band is not None), (more,) if len(plain) > 3 else ()
-        if len(plain) == 1 and (palette or use == "grey"):
+        if len(plain) == 1:
             return (plain[0],), ()
         if len(plain) == 3:
             return tuple(plain), (make_finding("ortho-colours-assumed", subject, names=file),)
-        wanted = "grey or red, green, blue" if use == "grey" else "red, green, blue for --ortho-bands rgb"
-        raise MapError(f"{path}: ortho has {dataset.count} bands ({names}), expected {wanted}, and alpha at most")
+        raise MapError(
+            f"{path}: ortho has {dataset.count} bands ({names}), expected grey or red, green, blue, and alpha at most"
+        )
     if len(plain) != 1:
         problem = f"{path}: {role} has {dataset.count} bands ({names[:80]}), expected one"
         has_colours = use == "classes" and len(plain) == 3 and kinds == {np.dtype(np.uint8)}
@@ -414,7 +419,7 @@ def _read_scaling(
     if use != "metres":
         size = np.dtype(dataset.dtypes[bands[0] - 1]).itemsize
         bits = dataset.tags(bands[0], ns="IMAGE_STRUCTURE").get("NBITS", 8 * size)  # 12 of 16
-        grey = (255.0 / (2 ** int(bits) - 1) if use in _WEIGHTS else 1.0, 0.0)
+        grey = (255.0 / (2 ** int(bits) - 1) if use == "grey" else 1.0, 0.0)
         if (scale, offset) == (1.0, 0.0):
             return grey, ()
         subject, file = Subject("layer", role), {"file": path.name}

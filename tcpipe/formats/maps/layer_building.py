@@ -20,15 +20,9 @@ from pyproj import CRS
 from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.errors import MapError
 from tcpipe.formats.geojson import shorten_problems
-from tcpipe.formats.maps.geotiff import (
-    OpenFile,
-    Tile,
-    Use,
-    read_tile,
-    read_window,
-)
+from tcpipe.formats.maps.geotiff import COLOUR_USES, OpenFile, Tile, Use, read_tile, read_window
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
-from tcpipe.terrain.layers import ClassScheme, Layer, Pixels
+from tcpipe.terrain.layers import PAPER_LAYERS, ClassScheme, Layer, Pixels
 from tcpipe.terrain.projection import Projection, parse_crs
 from tcpipe.terrain.resampling import mean, resample_bilinear, resample_majority
 from tcpipe.terrain.target_grid import LATTICE_STEP_PX, Georeference, MapGrid, compute_source_lattice
@@ -55,6 +49,8 @@ class Raster:
     _corners: Ints = field(repr=False)
     """First row, last row (not included), first column, last column of each tile, shape (T, 4)."""
     open_file: OpenFile = field(repr=False)
+    step: int = 1
+    """Every ``step``-th pixel of the files, in both directions, is a pixel of the raster."""
 
     @property
     def name(self) -> str:
@@ -69,14 +65,25 @@ class Raster:
         valid = np.zeros(values.shape, np.bool_)
         for n in np.flatnonzero((low < high).all(axis=1)).tolist():
             (top, left), (bottom, right) = low[n].tolist(), high[n].tolist()
-            row, _, col, _ = self._corners[n].tolist()
-            part, there = read_window(self.open_file, self.tiles[n], top - row, bottom - row, left - col, right - col)
+            (row, _, col, _), step, tile = self._corners[n].tolist(), self.step, self.tiles[n]
+            rows = (top - row) * step, min((bottom - row) * step, tile.rows)
+            cols = (left - col) * step, min((right - col) * step, tile.cols)
+            shape = (bottom - top, right - left) if step > 1 else None
+            part, there = read_window(self.open_file, tile, *rows, *cols, shape)
             if part.shape == values.shape and len(self.tiles) == 1:
                 return part, there
             window = slice(top - row0, bottom - row0), slice(left - col0, right - col0)
             np.copyto(values[window], part, where=there)
             valid[window] |= there
         return values, valid
+
+    def thin(self, step: int) -> Raster:
+        """Return the raster with every ``step``-th pixel alone."""
+        corners, (a, b, x, d, e, y) = self._corners // step, self.georeference.affine
+        affine = (a * step, b * step, x, d * step, e * step, y)
+        rows, cols = int(corners[:, 1].max()), int(corners[:, 3].max())
+        place = replace(self.georeference, affine=affine, rows=rows, cols=cols)
+        return replace(self, georeference=place, _corners=corners, step=step)
 
 
 def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile, crs: CRS | None = None) -> Raster:
@@ -321,6 +328,11 @@ class RasterLayer:
             return np.where(np.isfinite(shard), np.clip(np.rint(shard), 1.0, 255.0), 0.0).astype(np.uint8)
         return shard
 
+    def thin(self) -> RasterLayer:
+        """Return the layer of fewer source pixels, at least `_PICTURE_TAPS` each way for a pixel of the grid."""
+        ratio = _compute_source_px_per_px(self._compute_lattice(self.grid.rows // 2, self.grid.cols // 2, 1, 1))
+        return replace(self, raster=self.raster.thin(int(max(ratio // _PICTURE_TAPS, 1.0))))
+
     def explain_no_class(self) -> str | None:
         """Return the problem that none of its values is a class; None where some are."""
         if not self.tally.unnamed or self.scheme is None:
@@ -406,6 +418,41 @@ class RasterLayer:
             mean(source, lattice, parts, part)
         else:
             resample_bilinear(source, lattice, part)
+
+
+def split_colours(ortho: Raster) -> dict[str, Raster]:
+    """Return the colours of an orthophoto as rasters by layer; nothing of a grey one. Its findings are not repeated."""
+    if len(ortho.tiles[0].bands) == 1 and "palette" not in ortho.tiles[0].kind:
+        return {}
+    colours = dict[str, Raster]()
+    for layer, use in COLOUR_USES.items():
+        tiles = tuple(replace(tile, use=use) for tile in ortho.tiles)
+        colours[layer] = replace(ortho, role=layer, tiles=tiles, findings=())
+    return colours
+
+
+_PICTURE_BLOCK_PX = 128
+"""Side of the parts of a picture that are read for all colours in turn: GDAL keeps their pixels, and decodes them once."""
+
+_PICTURE_TAPS = 3
+"""Least source pixels that are averaged, each way, for a pixel of a picture; of a finer raster some are left out."""
+
+
+def draw_colours(ortho: RasterLayer, side_px: int) -> NDArray[np.uint8] | None:
+    """Return an orthophoto of at most ``side_px`` a side in colour, shape (R, C, 3), no data in white; None of a grey one."""
+    colours = split_colours(ortho.raster)
+    if not colours:
+        return None
+    grid, step = ortho.grid, -(-max(ortho.grid.rows, ortho.grid.cols) // side_px)
+    grid = replace(grid, pixel_size_m=step * grid.pixel_size_m, rows=-(-grid.rows // step), cols=-(-grid.cols // step))
+    layers = [
+        RasterLayer(PAPER_LAYERS[name], raster, grid, ortho.projection, None).thin() for name, raster in colours.items()
+    ]
+    picture = np.empty((grid.rows, grid.cols, len(layers)), np.uint8)
+    for row0, col0, rows, cols in iterate_shards(grid, _PICTURE_BLOCK_PX):
+        part = np.stack([layer.shard(row0, col0, rows, cols) for layer in layers], axis=-1)
+        picture[row0 : row0 + rows, col0 : col0 + cols] = np.where(part, part, 255)
+    return picture
 
 
 def _compute_source_px_per_px(lattice: Floats) -> float:

@@ -13,7 +13,8 @@ x, y         float64  pixel centres in the map's CRS [m]
 spatial_ref  int64    CF grid mapping: the CRS as WKT, and GDAL's GeoTransform
 ===========  =======  ==========================================================================
 
-The groups ``overviews/2``, ``overviews/4`` … hold the same arrays at coarser levels (`tcpipe.terrain.resampling`). Attributes follow
+The groups ``overviews/2``, ``overviews/4`` … hold the same arrays at coarser levels (`tcpipe.terrain.resampling`), and the array
+``overviews/rgb`` is the small picture that pages show of an orthophoto in colour. Attributes follow
 CF (``grid_mapping``, ``flag_values``) and GeoZarr (``proj:``, ``spatial:``), so that xarray opens map and overviews as they are, and
 so does GDAL from 3.13 on, the first that reads shards.
 """
@@ -58,6 +59,11 @@ TILE_PX = 512
 SHARD_PX = 2048
 """Side of a shard: the unit that is a file, and that is written at once."""
 
+PICTURE_PX = 900
+"""Longest side of a map's pictures: the width of a page [px]."""
+
+_PICTURE = "overviews/rgb"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Attributes:
@@ -74,6 +80,8 @@ class _Attributes:
     tile_px: int
     height_reference_m: float
     facts: MapFacts
+    picture_shape: tuple[int, int, int] | None = field(default=None, metadata=LEFT_OUT)
+    """Rows, columns and colours of the picture of an orthophoto in colour."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +94,7 @@ class MapFile(MapReader):
     factors: tuple[int, ...]
     _levels: Mapping[int, Mapping[str, ShardedArray]]
     """The arrays of each factor."""
+    _picture: ShardedArray | None
     _factor: int = 1
 
     def at(self, factor: int) -> MapFile:
@@ -114,6 +123,11 @@ class MapFile(MapReader):
         """Return a window of a layer as stored."""
         with _name_damage(f"map {self.name}: {layer}, rows {row0} to {row1}, columns {col0} to {col1}"):
             return self._levels[self._factor][layer].window(row0, row1, col0, col1)
+
+    def read_picture(self) -> NDArray[Any] | None:
+        """Return the orthophoto in colour, shape (R, C, 3), at most `PICTURE_PX` a side; None of a map without colours."""
+        with _name_damage(f"map {self.name}: its picture"):
+            return self._picture.chunk((0, 0, 0)) if self._picture else None
 
     def expect(self, tiles: Sequence[tuple[int, int]]) -> None:
         """Fetch tiles (row, column) of all layers that are read soon, if they are in a bucket."""
@@ -172,10 +186,11 @@ def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool =
             }
             for factor in kept.factors
         }
+        picture = _open_picture(path / _PICTURE, kept.picture_shape, fetched) if kept.picture_shape else None
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
     classes = ClassTable(kept.class_table)
-    return convert_record(kept, MapFile, classes=classes, layers=layers, _levels=levels)
+    return convert_record(kept, MapFile, classes=classes, layers=layers, _levels=levels, _picture=picture)
 
 
 def _refuse_sizes(kept: _Attributes, path: Path) -> None:
@@ -202,6 +217,14 @@ def _open_array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: 
         fill=fill,
         sparse=True,
         fetched=fetched,
+    )
+
+
+def _open_picture(path: Path, shape: tuple[int, int, int], fetched: FetchedShards | None) -> ShardedArray:
+    if max(shape) > PICTURE_PX or min(shape) < 1:
+        raise StoreError(f"{path}: has the shape {shape}, at most {PICTURE_PX} a side")
+    return open_sharded(
+        path, shape=shape, chunk_shape=shape, shard_shape=shape, dtype=np.dtype(np.uint8), fill=0, fetched=fetched
     )
 
 
@@ -255,6 +278,7 @@ class MapWriter:
         for factor in self._factors:
             group = self._group if factor == 1 else self._group.create_group(_level_path(factor).rstrip("/"))
             self._levels[factor] = {layer.name: _add_layer(group, layer, grid, factor) for layer in layers.values()}
+        self._picture_shape: tuple[int, int, int] | None = None
         self.height_reference_m: float | None = None
         """Reference of stored heights [m]: the floor of the smallest height of the first shard with heights."""
 
@@ -267,6 +291,16 @@ class MapWriter:
         _put(self._levels[1][layer], row0, col0, values)
         for factor, level in iterate_levels(self._layers[layer], values, self._factors):
             _put(self._levels[factor][layer], row0 // factor, col0 // factor, level)
+
+    def write_picture(self, colours: NDArray[np.uint8]) -> None:
+        """Write the orthophoto in colour, shape (R, C, 3), at most `PICTURE_PX` a side."""
+        rows, cols, count = self._picture_shape = colours.shape
+        dimensions = ("picture_y", "picture_x", "colour")
+        whole = (rows, cols, count)
+        array = add_array(
+            self._group, _PICTURE, shape=whole, dtype=np.uint8, chunks=whole, shards=whole, dimensions=dimensions
+        )
+        array[...] = colours
 
     def finish(self, facts: MapFacts, layers: Mapping[str, Layer]) -> None:
         """Write coordinates and attributes; ``layers`` are all those of before, with the range that was found."""
@@ -288,6 +322,7 @@ class MapWriter:
             tile_px=TILE_PX,
             height_reference_m=reference_m,
             facts=facts,
+            picture_shape=self._picture_shape,
         )
         self._group.attrs.update({"tcpipe_map": to_plain(kept)})
         consolidate_metadata(self._group)

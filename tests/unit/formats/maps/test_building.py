@@ -12,7 +12,7 @@ from rasterio import Affine
 from rasterio.control import GroundControlPoint
 
 from tcpipe.errors import MapError
-from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.building import MoreLayers, build_map
 from tcpipe.formats.maps.map_files import open_map
 
 WORLD = World("EPSG:32633", 560_000.0, 5_215_000.0, side_m=40.0)
@@ -381,3 +381,51 @@ def test_a_wanted_crs_must_be_metric(tmp_path):
             built(tmp_path, height=tmp_path / "h.tif", crs=crs)
     _, source = built(tmp_path, height=tmp_path / "h.tif", crs="EPSG:32633")
     check_plane(source)
+
+
+def colours_at(x, y):
+    """Red rises to the east, green to the north, blue is the same everywhere."""
+    return 1.0 + 6.0 * (x - LEFT), 1.0 + 6.0 * (y - TOP + 40.0), np.full_like(x, 200.0)
+
+
+ORTHOS = {
+    "north up": NORTH_UP,
+    "rotated": Affine(0.008, 0.006, LEFT + 2.0, 0.006, -0.008, TOP - 14.0),
+}
+
+
+@pytest.mark.parametrize("files", [1, 2])
+@pytest.mark.parametrize("name", ORTHOS)
+def test_an_orthophoto_has_a_small_picture_in_colour(tmp_path, height, name, files):
+    affine = ORTHOS[name]
+    size = 400 if name == "north up" else 2000
+    bands = np.concatenate([raster_of(lambda x, y, n=n: colours_at(x, y)[n], affine, size, size) for n in range(3)])
+    split = np.array_split(np.arange(size), files)
+    ortho = [
+        write_tif(
+            tmp_path / f"{part[0]}.tif",
+            np.rint(bands[:, part]).astype(np.uint8),
+            WORLD.crs,
+            affine @ Affine.translation(0, part[0]),
+            photometric="RGB",
+        )
+        for part in split
+    ]
+    _, source = built(tmp_path, height=height, ortho=ortho, pixel_size_m=0.04)
+    picture = source.read_picture()
+    assert max(picture.shape) <= 900
+    side_m = 40.0 / picture.shape[0]
+    i, j = np.indices(picture.shape[:2])
+    expected = np.stack(colours_at(LEFT + (j + 0.5) * side_m, TOP - (i + 0.5) * side_m), axis=-1)
+    there = (picture != 255).all(axis=2)
+    assert there.mean() > 0.2
+    assert np.abs(picture - expected)[there].max() <= 1.5
+    assert set(source.layers) == {"height", "ortho"}
+
+
+def test_a_grey_orthophoto_has_no_colours(tmp_path, height):
+    grey = write_tif(tmp_path / "g.tif", np.full((1, 400, 400), 90, np.uint8), WORLD.crs, NORTH_UP)
+    _, source = built(tmp_path, height=height, ortho=grey)
+    assert source.read_picture() is None
+    with pytest.raises(MapError, match="has no colours, expected red, green, blue for --ortho-bands rgb"):
+        built(tmp_path, height=height, ortho=grey, more=MoreLayers(ortho_bands="rgb"))
