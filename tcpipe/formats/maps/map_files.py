@@ -124,7 +124,7 @@ class MapFile(MapReader):
         with _name_damage(f"map {self.name}: {layer}, rows {row0} to {row1}, columns {col0} to {col1}"):
             return self._levels[self._factor][layer].window(row0, row1, col0, col1)
 
-    def read_picture(self) -> NDArray[Any] | None:
+    def read_picture(self) -> NDArray[np.uint8] | None:
         """Return the orthophoto in colour, shape (R, C, 3), at most `PICTURE_PX` a side; None of a map without colours."""
         with _name_damage(f"map {self.name}: its picture"):
             return self._picture.chunk((0, 0, 0)) if self._picture else None
