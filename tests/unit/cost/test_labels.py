@@ -122,11 +122,6 @@ def test_runs_pool_as_one():
     assert asdict(got) == pytest.approx(asdict(together))
 
 
-def test_without_energy_there_is_no_budget():
-    assert estimate_energy_budget(np.full(3, np.nan), {cause: np.ones(3) for cause in CAUSES}) is None
-    assert pool_budgets([]) is None
-
-
 @pytest.mark.parametrize(("volt", "outside"), [(19.9, True), (20.0, False), (30.0, False), (30.1, True)])
 def test_a_voltage_below_or_above_the_range_is_outside_and_the_ends_are_not(volt, outside):
     at = 1_000_000_000 * np.arange(5)

@@ -104,32 +104,6 @@ def test_two_runs_tell_less_of_a_third_than_twenty_do():
     assert few.of_run == pytest.approx(means.var(ddof=1) / errors.var() * (2.92 / 1.645) ** 2, rel=0.05)
 
 
-@pytest.mark.parametrize("count", [25, 60])
-def test_small_data_still_average_out(count):
-    found = fit_errors(made_residuals(count, runs=1))["energy"]
-    assert _width(found, 100) < 0.6 * _width(found, 1)
-
-
-def test_a_class_with_enough_held_out_samples_has_errors_of_its_own():
-    residuals = made_residuals(400, sigma=0.01)
-    residuals["terrain_class"] = np.where(np.arange(400) < 200, 4, 5)
-    residuals["power_watt"] = np.where(
-        residuals["terrain_class"] == 5, 150.0 + 6.0 * (residuals["power_watt"] - 150.0), residuals["power_watt"]
-    )
-    errors = fit_errors(residuals)["energy"]
-    ends = [errors.compute_intervals(np.array([100.0]), np.array([number], np.uint8)) for number in (4, 5, 7)]
-    grass, mud, other = ((high - low)[0] for low, high in ends)
-    assert grass < other < mud
-    assert mud > 4.0 * grass
-
-
-def test_pieces_without_a_cost_add_nothing():
-    errors = fit_errors(made_residuals(1000))["energy"]
-    some = errors.compute_sum(np.array([100.0, np.nan, 100.0]), np.full(3, _GRASS)).interval
-    assert np.isfinite(some).all()
-    assert some[0] < 200.0 < some[1]
-
-
 def test_too_few_held_out_samples_say_nothing():
     assert fit_errors(made_residuals(19)) is None
 
@@ -241,14 +215,6 @@ def test_propagation_is_that_of_small_errors():
     drawn = {"power": power, "velocity": velocity, "duration": 1.0 / velocity, "energy": power / velocity}
     assert {name: of[0] for name, of in found.items()} == pytest.approx(
         {name: of.std() for name, of in drawn.items()}, rel=0.02
-    )
-
-
-def test_errors_of_one_fold_are_wider_by_what_folds_differ():
-    residuals = made_residuals(4000)
-    one, two = (fit_errors({**residuals, "fold": fold})["energy"] for fold in (np.zeros(4000), np.arange(4000) % 2))
-    assert one.compute_std(np.full(1, 150.0), np.full(1, _GRASS)) == pytest.approx(
-        1.225 * two.compute_std(np.full(1, 150.0), np.full(1, _GRASS)), rel=1e-3
     )
 
 

@@ -26,22 +26,9 @@ def seconds(mask):
 STANDING = {"below_velocity_mps": 0.05, "below_yaw_rate_radps": 0.05}
 
 
-def test_standing_needs_both_limits():
-    assert masks.find_stationary(rows([0.04] * 3), **STANDING).all()
-    assert not masks.find_stationary(rows([0.04] * 3, yaw_rate=0.06), **STANDING).any()
-    assert not masks.find_stationary(rows([0.06] * 3), **STANDING).any()
-
-
 def test_a_change_of_direction_stands_for_an_instant():
     got = masks.find_stationary(rows([0.6, 0.3, -0.2, -0.6]), **STANDING)
     assert got.tolist() == [False, False, True, False]
-
-
-def test_stuck_is_wheels_without_ground():
-    limits = {"stationary_velocity_mps": 0.05, "wheel_velocity_above_mps": 0.2}
-    assert masks.find_stuck(rows([0.01] * 4, wheel=0.5), **limits).all()
-    assert not masks.find_stuck(rows([0.3] * 4, wheel=0.5), **limits).any()
-    assert not masks.find_stuck(rows([0.01] * 4), **limits).any()
 
 
 TURNING = {"below_velocity_mps": 0.1, "above_yaw_rate_radps": 0.1, "min_radius_m": 0.5, "min_s": 0.2}
@@ -127,15 +114,6 @@ def test_a_slow_ramp_and_the_jitter_of_a_joystick_are_no_change():
         assert not masks.find_command_changes(rows(0 * t, commanded=commanded), **CHANGE).any()
 
 
-def test_two_changes_are_both_found_and_an_unknown_command_is_none():
-    t = np.arange(0, 20, PERIOD)
-    commanded = np.where(t < 5, 0.0, np.where(t < 6, 1.0, 0.0))
-    got = seconds(masks.find_command_changes(rows(0 * t, commanded=commanded), **CHANGE))
-    assert (got.min(), got.max()) == (pytest.approx(5), pytest.approx(8))
-    commanded = np.where(t < 10, np.nan, 1.0)
-    assert not masks.find_command_changes(rows(0 * t, commanded=commanded), **CHANGE).any()
-
-
 def test_below_limit_follows_the_command_not_its_jitter():
     t = np.arange(0, 20, PERIOD)
     commanded = np.where(t < 10, 1.0, 0.8)
@@ -166,10 +144,6 @@ def test_a_limit_itself_is_not_below_nor_above_it():
     assert not masks.find_below_full_speed(rows([0.0] * 9, commanded=0.5), limit_mps=0.5, window_s=0.1).any()
     mean_is_the_limit = rows([0.0] * 3, commanded=[0.75, 0.25, 0.5])
     assert not masks.find_below_full_speed(mean_is_the_limit, limit_mps=0.5, window_s=0.1).any()
-
-
-def test_a_fast_turn_of_a_wide_arc_is_driving():
-    assert not masks.find_turning_in_place(rows([0.9] * 9, yaw_rate=0.15), **TURNING).any()
 
 
 def test_which_row_of_a_change_of_direction_stands():
@@ -216,11 +190,6 @@ def test_both_windows_touch_the_row_and_neither_holds_the_other_s():
     assert changed([0.0] * 20 + [1.0]) == [20]
 
 
-def test_a_window_holds_a_row_at_least():
-    for window_s in (0.02, 0.05):
-        assert changed([0.0] * 9 + [0.15] + [0.0] * 9, window_s=window_s) == [9, 10]
-
-
 @pytest.mark.parametrize(("step", "found"), [(0.18, True), (0.15, False)])
 def test_twice_what_jitter_leaves_is_allowed_for(step, found):
     jitter = np.where(
@@ -232,14 +201,6 @@ def test_twice_what_jitter_leaves_is_allowed_for(step, found):
 def test_a_command_that_ends_or_steps_across_a_hole_is_no_change():
     assert changed([1.0] * 20 + [np.nan] * 20) == []
     assert changed([0.0] * 20 + [1.0] * 20, piece=[0] * 20 + [1] * 20) == []
-
-
-def test_the_moment_of_a_change():
-    moment = lambda command, before, after, step: masks._find_moment(np.array(command), before, after, step_mps=step)  # noqa: E731
-    assert moment([0.0, 0.0, 1.0, 1.0], 0.0, 1.0, 0.1) == (2, 2)
-    assert moment([0.0, 0.5, 1.0], 0.0, 1.0, 0.1) == (1, 2)
-    assert moment([0.0, 0.5, 1.0], 0.0, 1.0, 0.5) == (2, 2)
-    assert moment([0.05, 0.05], 0.0, 0.05, 0.1) == (0, 0)
 
 
 def test_a_short_dip_does_not_bring_the_mean_below_the_limit():

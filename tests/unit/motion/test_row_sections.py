@@ -79,23 +79,7 @@ def test_slope_is_that_of_polyfit():
     assert got[39] == 0
 
 
-def test_slope_noise_is_as_documented():
-    value = np.random.default_rng(1).normal(0, 0.02, 20_000)
-    got = fit_slope(value, np.zeros(20_000, dtype=np.int64), half_window=4, period_s=0.05)
-    assert got.std() == pytest.approx(0.02 / 0.05 / np.sqrt(9 * 80 / 12), rel=0.03)
-
-
 def test_a_step_that_is_off_by_half_a_period_is_a_hole_and_any_other_epoch_a_piece():
     stamp_ns = np.array([0, 50, 125, 174, 224]) * 1_000_000
     assert number_pieces(stamp_ns, np.zeros(5, np.int16), period_ns=5e7).tolist() == [0, 0, 1, 1, 1]
     assert number_pieces(stamps(3), np.array([1, 0, 0], np.int16), period_ns=5e7).tolist() == [0, 1, 1]
-
-
-def test_a_window_that_ends_before_its_piece_begins_is_empty():
-    assert np.isnan(compute_window_mean(np.ones(3), np.zeros(3, np.int64), before=3, after=-2)[:2]).all()
-
-
-def test_two_rows_have_a_slope():
-    assert fit_slope(np.array([1.0, 3.0]), np.zeros(2, np.int64), half_window=4, period_s=0.5) == pytest.approx(
-        [4.0, 4.0]
-    )

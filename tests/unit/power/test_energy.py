@@ -39,12 +39,6 @@ def test_rules_differ_as_they_must():
     assert integrate_energy([straight], *half, rule="right_endpoint") == pytest.approx([44])
 
 
-def test_rails_add_up_and_regeneration_counts():
-    left, right = made_rail((0, 2), (24.0, 24.0), (5.0, 5.0)), made_rail((0, 2), (24.0, 24.0), (-1.0, -1.0))
-    assert integrate_energy([left, right], seconds(0.5), seconds(1.5), rule="exact") == pytest.approx([96])
-    assert compute_power_watt([left, right], seconds(1.0)) == pytest.approx([96])
-
-
 def test_energy_is_unknown_where_a_rail_is():
     left, right = made_rail((0, 2), (24.0, 24.0), (5.0, 5.0)), made_rail((1, 2), (24.0, 24.0), (5.0, 5.0))
     got = integrate_energy([left, right], seconds(0.5, 1.0), seconds(1.5, 2.0), rule="exact")
@@ -71,13 +65,6 @@ def test_samples_inside_are_counted_and_averaged():
     assert count.tolist() == [2, 3, 0]
     assert mean[:2] == pytest.approx([30, 140 / 3])
     assert np.isnan(mean[2])
-
-
-def test_a_record_counts_from_its_first_sample_to_its_last():
-    source = made_rail((1, 2, 3), (10.0,) * 3, (1.0, 1.0, 3.0))
-    assert integrate_recorded_energy([source], seconds(0.0), seconds(5.0), rule="exact") == pytest.approx([10 + 20])
-    assert integrate_energy([source], seconds(1.0), seconds(3.0), rule="exact") == pytest.approx([30])
-    assert np.isnan(integrate_energy([source], seconds(1.0), seconds(3.5), rule="exact")).all()
 
 
 def halts(*watts, rows=60):

@@ -8,13 +8,11 @@ from made_tracks import stamps
 from scipy.signal import lfilter
 
 from tcpipe.power.noise import (
-    compute_curvature,
-    compute_median_period_s,
     estimate_energy_noise,
     estimate_resolution,
     fit_signal_model,
 )
-from tcpipe.power.rails import Rail, SampledSignal, integrate_energy, make_rail, make_samples
+from tcpipe.power.rails import SampledSignal, integrate_energy, make_rail, make_samples
 
 ZERO = stamps(1)[0]
 STARTS = ZERO + (np.arange(5, 595, 1.3) * 1e9).astype(np.int64)
@@ -168,43 +166,6 @@ def test_readings_of_1970_cost_no_memory_and_change_no_deviation():
         assert peak_bytes < 40_000_000
 
 
-def test_the_median_period_needs_two_samples():
-    assert compute_median_period_s(make_samples(ZERO + np.array([0, 50_000_000]), np.zeros(2))) == pytest.approx(0.05)
-    assert compute_median_period_s(make_samples(ZERO + np.array([0]), np.zeros(1))) == np.inf
-
-
-def test_noise_does_not_hang_on_when_the_clock_began():
-    rng = np.random.default_rng(10)
-    value = 6 + rng.normal(0, 0.5, 240)
-    spans = np.array([[3.01, 5.27], [4.2, 6.4]])
-    found = []
-    for zero in (1_000_000_000, ZERO):
-        stamp_ns = zero + np.arange(240) * 50_000_000
-        made = [
-            make_rail(
-                "drive", make_samples(stamp_ns, np.full(240, 24.0)), make_samples(stamp_ns, value), averaged=False
-            )
-        ]
-        start_ns, end_ns = zero + np.round(spans * 1e9).astype(np.int64)
-        found.append(energy_noise_joule(made, start_ns, end_ns))
-    assert found[0] == pytest.approx(found[1], rel=1e-9)
-    assert (found[0] > 0).all()
-
-
-def test_a_resolution_shows_where_more_than_half_of_the_values_repeat():
-    assert estimate_resolution(SampledSignal(np.arange(4), np.array([0.0, 0.5, 0.0, 0.5]))) == 0.0
-    assert estimate_resolution(SampledSignal(np.arange(5), np.array([0.0, 0.5, 0.0, 0.5, 0.0]))) == 0.5
-    assert estimate_resolution(SampledSignal(np.arange(5), np.zeros(5))) == 0.0
-
-
-def test_nothing_is_said_of_two_samples_and_of_a_rail_without_any():
-    second = ZERO + np.array([0]), ZERO + np.array([1_000_000_000]), NEVER_STILL
-    assert estimate_energy_noise([record(np.arange(2.0), np.arange(2.0))], *second).std_joule().tolist() == [0.0]
-    empty = SampledSignal(np.empty(0, np.int64), np.empty(0))
-    gone = Rail("drive", empty, empty, False, empty.stamp_ns, empty.value, empty.value)
-    assert estimate_energy_noise([gone], *second).std_joule().tolist() == [0.0]
-
-
 def test_noise_of_a_current_counts_by_the_voltage_in_the_middle_of_a_span():
     t = np.arange(0, 60, 0.05)
     stamp_ns = ZERO + np.round(t * 1e9).astype(np.int64)
@@ -220,19 +181,10 @@ def test_noise_of_a_current_counts_by_the_voltage_in_the_middle_of_a_span():
     assert steep / flat == pytest.approx((10.0 + 0.5 * middle_s) ** 2, rel=1e-4)
 
 
-ZIGZAG = np.arange(100) % 2.0
-
-
 def signal(value, period_s=0.05):
     return SampledSignal(
         1_000_000_000 + np.round(np.arange(len(value)) * period_s * 1e9).astype(np.int64), np.array(value)
     )
-
-
-def test_curvature_is_the_distance_from_the_line_through_the_neighbours():
-    uneven = SampledSignal(np.array([0, 1, 3]) * 1_000_000_000, np.array([0.0, 1.0, 0.0]))
-    assert compute_curvature(uneven) == pytest.approx([1 / (1 + 1 / 9 + 4 / 9)])
-    assert compute_curvature(signal(ZIGZAG)) == pytest.approx(np.full(98, 1 / 1.5))
 
 
 def test_a_record_too_short_for_a_model_has_no_noise_and_one_without_steady_samples_that_of_all():

@@ -96,13 +96,6 @@ def test_a_current_that_passes_through_a_mark_is_real():
         np.testing.assert_array_equal(rail.current_amp, amp)
 
 
-def test_zeros_before_the_sensor_starts_and_after_it_stops_are_not_counted():
-    dead = (ROW < 95) | (ROW > COUNT - 40)
-    found = read(change(VOLT, dead, 0.0), change(AMP, dead, 0.0))
-    assert not select_findings(found.findings, "power-values-excluded", "power-rejected")
-    assert np.isnan(found.rails["/battery"][0].voltage_volt[dead]).all()
-
-
 def test_rows_of_a_table_may_hold_a_voltage_or_a_current():
     """Two sensors of different rates in one table: most rows have only one of both."""
     at_voltage = ROW % 4 == 0
@@ -186,22 +179,3 @@ def test_a_stated_nominal_voltage_is_reported_once():
 @pytest.mark.parametrize(("status", "charging"), [(1, True), (2, False), (0, False)])
 def test_a_battery_states_that_it_is_charged(status, charging):
     assert read(power_supply_status=np.full(COUNT, status)).facts.charging is charging
-
-
-@pytest.mark.parametrize("amp", [0.0, -1.0])
-def test_most_rows_may_be_marked(amp):
-    rows = np.random.default_rng(8).random(COUNT) < 0.6
-    (rail,) = read(change(VOLT, rows, np.nan), change(AMP, rows, amp)).rails["/battery"]
-    np.testing.assert_array_equal(np.isnan(rail.current_amp), rows)
-
-
-def test_a_constant_current_with_marks_has_no_steps():
-    known = [PowerSource("my_msgs/msg/Battery", "v", "i")]
-    columns = {"log_time_ns": TIME_NS, "v": VOLT, "i": np.where(ROW % 3 == 0, 32.767, 5.0)}
-    (rail,) = readings.read_power({"/b": ("my_msgs/msg/Battery", columns)}, known).rails["/b"]
-    assert np.nanmax(rail.current_amp) == 5.0
-
-
-def test_a_fifth_of_the_currents_may_be_at_a_limit_of_the_register():
-    rows = np.random.default_rng(9).random(COUNT) < 0.2
-    assert compute_energy(read(amp=change(AMP, rows, -327.67))) == pytest.approx(RIGHT, rel=0.005)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.power.rails import compute_power_at, compute_power_watt, make_samples
+from tcpipe.power.rails import compute_power_at, make_samples
 from tcpipe.power.rails import make_rail as made_of
 
 MS = 1_000_000
@@ -58,28 +58,3 @@ def test_samples_are_sorted_and_finite_and_the_first_of_a_stamp_counts():
     got = make_samples(np.array([2, 1, 1, 3]), np.array([5.0, 1.0, 7.0, np.nan]))
     assert got.stamp_ns.tolist() == [1, 2]
     assert got.value.tolist() == [1.0, 5.0]
-
-
-def test_an_averaged_power_between_two_samples_is_that_of_the_later():
-    source = rail([0, 1000, 2000], [30, 30, 30], [1, 10, 1], averaged=True)
-    at = np.array([-500, 0, 1, 999, 1000, 1001, 2000, 2500], np.int64) * MS
-    assert compute_power_watt([source], at).tolist() == [30, 30, 300, 300, 300, 30, 30, 30]
-
-
-def test_ends_are_held_whatever_the_number_of_samples():
-    for count in (2, 3, 4):
-        source = rail(range(0, 1000 * count, 1000), [30] * count, range(1, count + 1), averaged=True)
-        at = np.array([-500, 1000 * count], np.int64) * MS
-        assert compute_power_watt([source], at).tolist() == [30, 30 * count]
-
-
-def test_a_gap_behind_the_first_sample_is_one():
-    source = rail([0, 5000, 5050, 5100, 5150], np.full(5, 24.0), np.ones(5))
-    at = np.array([0, 2500, 5000, 5025, 5150], np.int64) * MS
-    assert np.isnan(compute_power_at([source], at, max_gap_ns=300 * MS)[2]).tolist() == [
-        False,
-        True,
-        False,
-        False,
-        False,
-    ]

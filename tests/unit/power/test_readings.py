@@ -307,52 +307,6 @@ def test_a_refusal_says_how_much_flows_back_and_which_sign_it_would_be(drawn: st
     assert [of.name for of in found.remedies] == [f"drawn_{other}", f"drawn_{drawn}"]
 
 
-@pytest.mark.parametrize(("rows", "refused"), [(19, False), (20, True)])
-def test_twenty_rows_speak_against_the_sign_of_their_type(rows, refused) -> None:
-    columns = {"log_time_ns": TIMES["log_time_ns"][:rows], "v": VOLT[:rows], "i": -AMP[:rows]}
-    found = readings.read_power({"/b": ("my_msgs/msg/Battery", columns)}, [source(sign="drawn_positive")])
-    assert bool(found.rails) != refused
-
-
-@pytest.mark.parametrize(("period_s", "count", "known"), [(10.0, 3, True), (10.0, 2, False), (10.1, 3, False)])
-def test_three_messages_ten_seconds_apart_are_enough(period_s, count, known) -> None:
-    columns = {"log_time_ns": period_s * 1e9 * np.arange(count), "v": VOLT[:count], "i": AMP[:count]}
-    found = readings.read_power({"/b": ("my_msgs/msg/Battery", columns)}, [source(sign="drawn_positive")])
-    assert bool(found.rails) == known
-
-
-def test_values_at_the_bounds_of_what_is_usual_are_kept() -> None:
-    volt, amp = np.full(N, 20.0), 600.0 + 40.0 * AMP
-    volt[[10, 11, 12, 13]], amp[[5, 6]] = [12.0, 28.0, 11.99, 28.01], [1000.0, 1000.1]
-    topics = {"/b": ("my_msgs/msg/Battery", TIMES | {"v": volt, "i": amp})}
-    (rail,) = readings.read_power(topics, [source(sign="auto")], current_sign="drawn_positive").rails["/b"]
-    for values in (rail.voltage_volt, rail.current_amp):
-        assert np.flatnonzero(np.isnan(values)).tolist() == [6, 12, 13]
-
-
-def test_a_row_stands_for_the_time_around_it_and_beside_a_hole_for_three_periods_at_most() -> None:
-    found = readings._weight_s(np.array([0.0, 1.0, 2.0, 3.0, 13.0, 14.0, 15.0]))
-    assert found.tolist() == [1.0, 1.0, 1.0, 3.0, 3.0, 1.0, 1.0]
-    assert readings._weight_s(np.array([5.0])).tolist() == [1.0]
-    assert readings._weight_s(np.array([0.0, 0.05, 0.1, 0.15])) == pytest.approx([0.05] * 4)
-
-
-def test_a_jackals_drive_feedback_and_the_voltage_of_its_power_are_one_rail() -> None:
-    """The worked example of the how-to: 50 Hz of current, a voltage now and then."""
-    feedback = TIMES | {"drivers[].current": np.stack((AMP, 2 * AMP), -1)}
-    power = {"log_time_ns": np.arange(4) * 500_000_000, "measured_voltages": np.full((4, 3), 26.0)}
-    topics = {"/feedback": ("clearpath_platform_msgs/msg/Feedback", feedback), "/power": (CLEARPATH_POWER, power)}
-    known = [
-        PowerSource("clearpath_platform_msgs/msg/Feedback", current="drivers[].current"),
-        PowerSource(CLEARPATH_POWER, "measured_voltages[0]"),
-    ]
-    found = readings.read_power(topics, known)
-    (current,), (voltage,) = found.rails["/feedback"], found.rails["/power"]
-    assert current.name == voltage.name
-    np.testing.assert_allclose(current.current_amp, 3 * AMP)
-    np.testing.assert_array_equal(voltage.voltage_volt, 26.0)
-
-
 @pytest.mark.parametrize(
     "type_name",
     [

@@ -89,13 +89,6 @@ def test_of_missing_messages_the_next_reading_is_no_older_than_it_says():
     assert np.abs(rows[1:-1, None] - arrivals).min(axis=1).max() <= 1
 
 
-def test_a_robot_that_stands_is_read_as_often_as_one_that_drives():
-    value, _ = repeated(2.0, step=0.1)
-    value[2000:4000] = value[2000]
-    rows = find_readings(AT_NS, value[:, None])
-    assert np.diff(rows).max() <= 11
-
-
 def test_twenty_readings_are_too_few():
     value, _ = repeated(1.0, step=0.01)
     assert find_readings(AT_NS[:400], value[:400, None]) is None
@@ -118,26 +111,6 @@ def test_a_mean_of_a_second_is_told_and_a_sample_never_taken_for_one():
         said[averaged] = is_stated_averaged(drawn.stamp_ns, watt, wheels.stamp_ns, *motion)
     assert said[True] is True
     assert said[False] is not True
-
-
-def drawn_by(late_s: float, width_s: float):
-    """Power at 1 Hz that follows a speed of two tones, late by so much and over such a width; and the motion at 50 Hz."""
-    motion_s = np.arange(0.0, 200.0, 0.02)
-    speed = 1.0 + 0.4 * np.sin(1.1 * motion_s) + 0.3 * np.sin(2.3 * motion_s)
-    power_s = np.arange(2.0, 198.0)
-    ago_s = late_s + width_s * (np.arange(50) + 0.5) / 50
-    watt = 80.0 + 150.0 * np.interp((power_s[:, None] - ago_s).ravel(), motion_s, speed).reshape(-1, 50).mean(1)
-    return (power_s * 1e9).astype(np.int64), watt, (motion_s * 1e9).astype(np.int64), speed, 0.0 * speed
-
-
-@pytest.mark.parametrize(("late_s", "width_s", "wanted"), [(0.0, 1.0, True), (0.0, 0.0, False), (3.0, 0.0, None)])
-def test_by_a_formula(late_s, width_s, wanted):
-    assert is_stated_averaged(*drawn_by(late_s, width_s)) is wanted
-
-
-def test_too_little_tells_nothing():
-    assert is_stated_averaged(*(values[:40] for values in drawn_by(0.0, 1.0))) is None
-    assert is_stated_averaged(*(values[:0] for values in drawn_by(0.0, 1.0))) is None
 
 
 def drive_by_formula(seed):
@@ -206,17 +179,6 @@ def test_power_that_wanders_slowly_in_a_short_record_is_no_smoothing(seed):
     ground = 60.0 * wandering(COUNT, 200, np.random.default_rng(seed + 100))[:1800]
     power = make_samples(at_ns, 90.0 * motion[:, 0] + ground)
     assert find_smoothing(make_power_fit(power, at_ns, motion, averaged=False, margin_s=SMOOTHING_MARGIN_S)) is None
-
-
-def test_a_correction_of_more_than_every_width_is_no_smoothing():
-    motion, power = drive_by_formula(0)
-    assert (
-        find_smoothing(
-            make_power_fit(make_samples(AT_NS, power), AT_NS, motion, averaged=False, margin_s=SMOOTHING_MARGIN_S),
-            corrected_s=-30.0,
-        )
-        is None
-    )
 
 
 def find_delay_of(power, motion, delay_s, *, rate_hz=20.0):

@@ -5,9 +5,7 @@ import pytest
 
 from tcpipe.power.rails import integrate_energy, make_rail, make_samples
 from tcpipe.power.sources import (
-    LARGEST_AMP,
     RailReadings,
-    apply_sign,
     count_energy,
     find_lone_side,
     find_quantity,
@@ -48,23 +46,6 @@ def source(**said):
 )
 def test_a_voltage_is_believed_from_one_volt_to_a_thousand(volt, why):
     assert reason([volt, volt], VARIED) == why
-
-
-def test_a_voltage_of_zeros_says_whether_the_current_is_too():
-    assert reason([0, 0], VARIED) == "voltage-zero"
-    assert rejection([0, 0], VARIED).numbers == {"median_volt": 0.0, "median_amp": 5.5, "rows_count": 2.0}
-    assert rejection([0, 0], [0, 0]).numbers["median_amp"] == 0.0
-    assert rejection([0, 0], [np.nan, np.nan]).numbers == {"median_volt": 0.0, "rows_count": 2.0}
-    assert reason([0, 24, 24], [5, 6, 7]) is None
-
-
-def test_a_current_alone_and_a_voltage_alone_are_judged():
-    nothing = [np.nan, np.nan]
-    assert reason([24, 25], nothing) is None
-    assert reason(nothing, VARIED) is None
-    assert reason(nothing, nothing) == "no-numbers"
-    assert reason([24, 25], [LARGEST_AMP, LARGEST_AMP]) is None
-    assert reason(nothing, [-LARGEST_AMP - 1, -LARGEST_AMP - 2]) == "current-in-milliamperes"
 
 
 def test_a_current_that_never_changes_is_refused_beyond_twenty_rows():
@@ -113,12 +94,6 @@ def test_a_sign_is_clear_where_more_than_eight_tenths_flow_one_way():
     assert sign_by_mean(np.zeros(20), weight) == (0, 0.0)
     assert sign_by_mean(np.array([-1.0, 1.0]), np.array([1.0, 99.0])) == (1, pytest.approx(0.98))
     assert sign_by_mean(np.array([1e-3, np.nan]), np.ones(2)) == (1, pytest.approx(1.0))
-
-
-def test_with_sign_turns_the_current_alone():
-    rail = apply_sign(RailReadings("b", VARIED, VARIED), -1)
-    assert rail.current_amp.tolist() == [-5.0, -6.0]
-    assert rail.voltage_volt.tolist() == [5.0, 6.0]
 
 
 def test_the_last_word_of_a_topic_tells_its_quantity_and_the_rest_its_rail():
@@ -230,11 +205,6 @@ def test_an_unsigned_current_that_idles_just_below_zero_is_not_at_the_end_of_its
     for wraps_amp in (4096.0, None):
         (rail,) = read_rails(columns, [source(current_scale=scale, wraps_amp=wraps_amp)], "/b")
         assert rail.unmeasured_count == 0
-
-
-def test_a_current_that_is_never_known_shows_nothing_of_the_others():
-    unknown = np.column_stack((np.repeat(draw_currents(1, 0.05)[::200, 0], 200), np.full(2000, np.nan)))
-    assert not find_unmeasured(unknown, AT_NS).any()
 
 
 def test_the_drives_of_one_side_alone_are_found():

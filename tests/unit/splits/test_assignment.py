@@ -89,14 +89,6 @@ def test_test_is_the_ceiling_of_its_share(n, tests):  # 6428 is the paper's area
         assert draw_samples(ranks([str(i) for i in range(n)]), arrival, test_fraction=0.2).sum() == tests
 
 
-def test_test_holds_the_lowest_ranks_of_every_run():
-    found, run = ranks(IDS, seed=3), np.arange(1000) % 3
-    test = draw_samples(found, run, test_fraction=0.2)
-    for number in range(3):
-        assert found[test & (run == number)].max() < found[~test & (run == number)].min()
-        assert (test & (run == number)).sum() in (66, 67)
-
-
 def test_row_order_says_nothing_of_the_holdout():
     order = np.argsort(hash_ranks(IDS, seed=0, purpose="order"))
     test = draw_samples(ranks(IDS), np.zeros(1000, int), test_fraction=0.5)[order]
@@ -124,19 +116,6 @@ def test_blocks_that_are_far_apart_are_told_apart():
     cells = [(0, 1), (1, 0), (32, 0), (-32, 2), (2**20, -(2**20)), (-(2**20), 2**20)]
     found = blocks(10.0 * np.array(cells) + 5.0)
     assert [found.names[member] for member in found.member] == [f"10:{column}:{row}" for column, row in cells]
-
-
-def test_a_group_that_would_overshoot_is_passed_over():
-    for seed in range(20):
-        assert drawn(grouped([60, 20, 20]), seed=seed).sum() == 20
-
-
-def test_a_fold_once_given_stays():
-    groups = grouped([7] * 30)
-    arrival = groups.member // 10
-    early = arrival == 0
-    first = draw_folds(Groups(groups.member[early], groups.names[:10]), arrival[early], folds=3, seed=0)
-    assert draw_folds(groups, arrival, folds=3, seed=0)[:10].tolist() == first.tolist()
 
 
 def test_a_cell_begins_at_its_border_and_holds_one_group_in_every_direction():

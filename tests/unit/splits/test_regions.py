@@ -42,28 +42,6 @@ def test_a_region_around_the_world_is_cut_to_the_window_before_it_is_projected()
     assert 15 < max(seen) <= 16
 
 
-def test_a_border_in_pieces_is_as_near_as_the_whole():
-    """Corners on whole metres, so that squares touch borders, cross them, and lie exactly a buffer away."""
-    rng = np.random.default_rng(0)
-    for _ in range(12):
-        turns = np.sort(rng.uniform(0.0, 2.0 * np.pi, 90))
-        star = shapely.Polygon(
-            np.round(rng.uniform(5.0, 20.0, (90, 1)) * np.stack([np.cos(turns), np.sin(turns)], axis=1))
-        )
-        parts = shapely.get_parts(shapely.make_valid(star))
-        region = Regions(
-            shapely.union_all([part for part in parts if part.geom_type == "Polygon"]), exclude=shapely.box(2, 2, 9, 5)
-        )
-        corners = np.round(rng.uniform(-25.0, 25.0, (300, 1, 2))) + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        footprints, borders = shapely.polygons(corners), region.borders()
-        through = shapely.intersects(borders, footprints) & ~shapely.touches(borders, footprints)
-        for buffer_m in (0.0, 1.0, 2.5):
-            wanted = through | (shapely.distance(borders, footprints) < buffer_m)
-            found = classify_footprints(corners, region, buffer_m=buffer_m)
-            excluded = shapely.covers(region.exclude, footprints)
-            np.testing.assert_array_equal(found[~excluded] == Side.BUFFER, wanted[~excluded])
-
-
 def test_a_region_of_very_many_vertices_is_one_of_few_edges_near_each_footprint():
     """A circle of 300,000 vertices, as traced from an image; every footprint lies near its border."""
     turns = np.linspace(0.0, 2.0 * np.pi, 300_000, endpoint=False)

@@ -96,11 +96,6 @@ def test_where_a_bit_begins(column, below, above, bit):
     assert flags(cut(**{column: [above]})) == {bit}
 
 
-def test_a_curve_is_one_against_its_own_chord():
-    assert flags(cut(arc_length_m=[2.1], chord_m=[2.0])) == set()
-    assert flags(cut(arc_length_m=[2.2], chord_m=[2.0])) == {Quality.CURVED}
-
-
 def test_without_a_known_limit_no_command_is_below_it():
     assert flags(cut(commanded_velocity_mps=[0.1]), about=info(mask=None)) == set()
     assert flags(cut(commanded_velocity_mps=[0.1]), about=info(mask=replace(MASKED, full_speed_mps=None))) == set()
@@ -203,13 +198,6 @@ def test_a_circle_turns_by_its_radius_across_the_cut_of_the_yaw(side):
     assert to_floats(table, "curvature_radpm") == pytest.approx(side / 4.0, rel=1e-4)
     assert np.isnan(to_floats(table, "yaw_change_std_rad")).all()
     assert table["vibration_mps2"].null_count == table.num_rows
-
-
-def test_turns_that_cancel_are_a_turn_rate_and_no_turn():
-    rate = 0.3 * np.sign(np.sin(2 * np.pi * T / 0.4 + 0.1))
-    table = labelled(straight_track(np.full(len(T), 0.8), yaw_rate_radps=rate))
-    assert to_floats(table, "yaw_change_rad") == pytest.approx(0.0, abs=1e-9)
-    assert (to_floats(table, "mean_abs_yaw_rate_radps") > 0.2).all()
 
 
 def test_slip_is_of_the_wheels_and_unknown_without_them():

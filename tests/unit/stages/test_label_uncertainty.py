@@ -163,9 +163,3 @@ def test_no_zero_is_off_while_charging_or_where_one_halt_draws_power_or_within_t
         name: (stamp_ns, volt, np.where(T < 18.0, -4.0, amp)) for name, (stamp_ns, volt, amp) in rails(count=1).items()
     }
     assert find_negative_idle(charged) is None
-
-
-def test_an_offset_below_the_idle_current_is_in_the_uncertainty():
-    true, off = label(rails(count=1)), label(rails(offset_amp=-0.35, count=1))
-    error = to_floats(off, "energy_joule") - to_floats(true, "energy_joule")
-    assert (np.abs(error) < 2.0 * to_floats(off, "energy_std_joule")).all()

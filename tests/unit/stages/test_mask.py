@@ -75,13 +75,6 @@ def test_start_and_stop_without_commands():
     assert codes_of(masked) == ["no-command"]
 
 
-def test_a_robot_that_coasts_to_a_halt_under_a_standing_command():
-    masked = gate(straight_track(start_and_stop(rate=0.4), commanded_mps=np.ones(len(T))))
-    kept = masked.table["dropped_by"].to_numpy() == 0
-    assert not kept[(T < 7) | (T > 48)].any()
-    assert kept[(T > 7.6) & (T < 47.4)].all()
-
-
 @pytest.mark.parametrize(("share", "limit"), [(0.7, 0.7), (0.3, 1.0)])
 def test_the_top_command_of_a_run_is_its_limit_where_most_is_driven_at_it(share, limit):
     commanded = np.where(60 * share > T, 0.7, 0.35)
@@ -110,12 +103,6 @@ def test_below_the_limit_unless_it_is_unknown_or_allowed():
     assert (finding.code, finding.remedies[0].recipe) == ("max-velocity-unknown", {"mask": {"max_velocity_mps": 0.7}})
     assert not rows_of(gate(track, config=MaskConfig(max_velocity_mps=0.7)), DropReason.BELOW_FULL_SPEED).any()
     assert gate(track).info.report.findings[0].numbers["held_fraction"] == 1.0
-
-
-def test_stuck_has_its_own_reason():
-    masked = gate(straight_track(np.full(len(T), 0.01), wheel_mps=np.where(T < 30, 0.0, 0.7)))
-    assert rows_of(masked, DropReason.STATIONARY).tolist() == (T < 30).tolist()
-    assert rows_of(masked, DropReason.STUCK).tolist() == (T >= 30).tolist()
 
 
 def test_reversing_is_dropped_unless_kept():
@@ -185,15 +172,6 @@ def test_an_error_of_scale_that_a_run_has_in_common_makes_no_gap():
     facts = replace(track.info.report.facts, fuse=FuseFacts(200, (), {}, {}, {}, {}, 0.0, (stretch,)))
     known = gate(replace(track, info=replace(track.info, report=StageReport((), facts))))
     assert not rows_of(known, DropReason.GAP).any()
-
-
-def test_rows_and_reasons_are_counted():
-    masked = gate(straight_track(start_and_stop(), commanded_mps=np.where((T >= 5) & (T < 49.1), 1.0, 0.0)))
-    facts = masked.info.report.facts.mask
-    dropped_by = masked.table["dropped_by"].to_numpy()
-    assert facts.rows == len(T)
-    assert facts.rows_kept == (dropped_by == 0).sum()
-    assert facts.rows_dropped["stationary"] == rows_of(masked, DropReason.STATIONARY).sum()
 
 
 def test_an_empty_track_and_one_row():

@@ -216,13 +216,6 @@ def test_the_rails_keep_their_names_and_their_sum_is_the_robots_current() -> Non
     np.testing.assert_allclose(sum(first["current_amp"]), 7.0, atol=1e-6)
 
 
-def test_the_same_log_gives_the_same_bytes() -> None:
-    one, two = read(husky()), read(husky())
-    assert all(one.tables[role].equals(two.tables[role], check_metadata=True) for role in one.tables)
-    assert one.report == two.report
-    assert one.sensors == two.sensors
-
-
 def test_only_the_topics_of_roles_are_read_and_tf_only_where_it_is_needed() -> None:
     moving = transforms(("odom", "base_link", (1.0, 0.0, 0.0), Rotation.identity()))
     log = MemoryLog(husky(**{"/tf": moving, "/image": ("sensor_msgs/msg/Image", message_table(1, 1.0))}))
@@ -302,23 +295,6 @@ def test_two_frames_are_not_joined_unless_the_recipe_states_one_place() -> None:
     assert placed.tables["wheel_odometry"].num_rows == 500
 
 
-def test_missing_gnss_and_power_are_warnings() -> None:
-    found = read({"/odom": odometry()})
-    assert set(found.tables) == {"wheel_odometry"}
-    assert codes(found) == {"no-gnss", "no-power", "no-imu"}
-
-
-def test_power_that_cannot_be_believed_is_a_warning_too() -> None:
-    rows = 60
-    dead = ("sensor_msgs/msg/BatteryState", message_table(rows, 1.0, voltage=full(rows, 0.0), current=full(rows, 0.0)))
-    found = read({"/odom": odometry(), "/battery": dead})
-    assert "power" not in found.tables
-    (rejected,) = select_findings(found.report.findings, "power-rejected")
-    assert rejected.names["reason"] == "voltage-zero"
-    assert rejected.numbers == {"median_volt": 0.0, "median_amp": 0.0, "rows_count": 60.0}
-    assert "no-power" not in codes(found)
-
-
 def test_topics_without_messages_play_no_part_even_where_the_index_cannot_tell() -> None:
     log = MemoryLog(
         {name: (kind, table.slice(0, 0)) for name, (kind, table) in husky().items()} | {"/odom": odometry()}
@@ -394,21 +370,6 @@ def test_a_log_whose_only_motion_is_unusable_fails_and_says_why() -> None:
     assert error.value.problems[0].startswith("no motion in the log")
     (unused,) = select_findings(error.value.findings, "messages-unused")
     assert unused.numbers["no_fix_count"] == 50
-
-
-def test_ambiguity_is_one_error() -> None:
-    with pytest.raises(RoleError, match="role imu is ambiguous") as error:
-        read(husky(**{"/other/imu": imu(), "/other/fix": fix()}))
-    assert "role gnss is ambiguous" in str(error.value)
-
-
-def test_visual_odometry_without_twist_keeps_its_pose() -> None:
-    found = read(husky(**{"/zed/zed_node/odom": odometry(speed_mps=0.0, child="zed_camera")}))
-    table = found.tables["visual_odometry"]
-    assert table["velocity_x_mps"].null_count == table.num_rows == 500
-    assert table["x_m"].null_count == 0
-    assert found.sensors["visual_odometry"].frame_id == "zed_camera"
-    assert "twist-zero" in codes(found)
 
 
 def test_settings_of_the_recipe_reach_their_role() -> None:
@@ -575,23 +536,6 @@ def test_a_pose_is_placed_by_its_crs_and_stands_in_for_the_fixes():
     for crs, said in (("EPSG:4326", "not projected"), ("MTM 7", "not a CRS")):
         with pytest.raises(RecipeError, match=said):
             read(topics, topics={"pose": ["/slam/pose"]}, pose_crs=crs)
-
-
-def test_a_go2s_speed_is_mapped_and_its_power_known() -> None:
-    """The worked example of the how-to: neither message has a header."""
-    speed = pa.FixedSizeListArray.from_arrays(pa.array(np.tile([0.8, 0.0, 0.0], 500)), 3)
-    state = message_table(500, 50.0, frame=None, velocity=speed, yaw_speed=full(500, 0.1))
-    low = message_table(500, 50.0, frame=None, power_v=full(500, 28.0), power_a=-6.0 + np.cos(np.arange(500)))
-    topics = {
-        "/lowstate": ("unitree_go/msg/LowState", low),
-        "/sportmodestate": ("unitree_go/msg/SportModeState", state),
-    }
-    fields = {"wheel_odometry": {"linear_x": "velocity[0]", "angular_z": "yaw_speed"}}
-    found = read(topics, topics={"wheel_odometry": ["/sportmodestate"]}, fields=fields)
-    assert set(found.tables) == {"wheel_odometry", "power"}
-    assert found.tables["wheel_odometry"]["velocity_x_mps"].to_pylist() == [0.8] * 500
-    assert min(found.tables["power"]["current_amp"].to_pylist()) > 4.9
-    assert found.sensors["power"].time_source == "log"
 
 
 def test_reading_takes_room_for_little_more_than_its_tables() -> None:

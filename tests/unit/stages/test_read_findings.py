@@ -9,7 +9,7 @@ from tcpipe.logs.roles import PlayedRole, RoleAssignment
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read import make_read_report
 from tcpipe.stages.read_sources import TopicReadings
-from tcpipe.tables.facts import ClockStep, PowerSign
+from tcpipe.tables.facts import ClockStep
 from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import Sensor
 
@@ -45,18 +45,6 @@ def read(topic=None, clock=None, *, steps=(), power=None, findings=(), timelines
 
 def codes(report):
     return [of.code for of in report.findings]
-
-
-def test_facts_of_a_plain_topic():
-    found = read()
-    assert found.findings == ()
-    facts = found.facts
-    assert (facts.left_out, facts.epochs) == ({"/other": "it is slower"}, 1)
-    assert (facts.time_offset_s, facts.power) == ({"gnss": 0.25}, None)
-    topic = facts.roles["gnss"]["/fix"]
-    assert (topic.type, topic.messages, topic.rows) == (SENSOR.type_name, COUNT, COUNT)
-    assert topic.rate_hz == pytest.approx(10.0)
-    assert (topic.time.source, topic.time.offset_s) == ("header", 0.5)
 
 
 @pytest.mark.parametrize(("lost", "said"), [(2, False), (3, True)])
@@ -119,14 +107,3 @@ def test_a_rate_is_that_inside_epochs_and_unknown_of_one_row():
     assert read(clock=two).facts.roles["gnss"]["/fix"].rate_hz == pytest.approx(10.0)
     single = timeline(stamp_ns=stamp_ns[:1], clock_epoch=np.zeros(1, np.int16), row=np.arange(1))
     assert read(clock=single).facts.roles["gnss"]["/fix"].rate_hz is None
-
-
-ODD = make_finding("power-includes-loads", Subject("role", "power"), names={"loads": "computers"})
-POWER = PowerReadings(findings=(ODD,), facts=PowerSign("drawn", averaged=True, includes=("computers",)))
-
-
-def test_notes_that_count_nothing_are_left_out_and_powers_are_told():
-    found = read(source(notes={"zero": 0, "set_aside": 3}), power=POWER)
-    assert found.facts.roles["gnss"]["/fix"].notes == {"set_aside": 3}
-    assert found.facts.power == PowerSign("drawn", averaged=True, includes=("computers",))
-    assert found.findings == (ODD,)

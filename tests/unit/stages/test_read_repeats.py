@@ -49,12 +49,6 @@ def test_a_voltage_that_hardly_changes_comes_with_the_current(volt):
     assert rates_hz(rails) == [2.0, 2.0]
 
 
-def test_of_several_rails_each_has_its_own_rate():
-    volt = held(drawn(1) + 20, 4)
-    rails, _ = read({"left": (STAMP_NS, volt, held(drawn(2), 4)), "right": (STAMP_NS, 20 + drawn(4), drawn(5))})
-    assert rates_hz(rails) == [5.0, 5.0, 20.0, 20.0]
-
-
 def test_a_voltage_alone_on_its_topic_is_told_by_itself():
     nothing = np.full(COUNT, np.nan)
     volt, amp = held(drawn(1) + 20, 20), drawn(2)
@@ -64,24 +58,6 @@ def test_a_voltage_alone_on_its_topic_is_told_by_itself():
     assert [each.quantity for each in repeats] == ["voltage"]
     (found,) = find_repeats(repeats)
     assert (found.code, found.names["quantity"]) == ("power-readings-repeated", "voltage")
-
-
-@pytest.mark.parametrize(
-    ("volt", "amp"),
-    [
-        (np.full(COUNT, 25.0), np.round(5.0 + 0.08 * np.random.default_rng(1).standard_normal(COUNT), 1)),
-        (np.full(COUNT, 25.0), np.full(COUNT, 3.0)),
-        (np.full(COUNT, 25.0), np.where(np.random.default_rng(2).random(COUNT) < 0.5, 3.0, 8.0)),
-        (np.round(25 - np.arange(COUNT) / 1000, 1), drawn(6)),
-        (np.full(COUNT, 25.0), np.linspace(0.0, 20.0, COUNT)),
-    ],
-    ids=["quiet driving in steps of 0.1 A", "standing", "two levels", "voltage that sinks", "ramp"],
-)
-def test_a_signal_measured_for_every_message_stays_as_it_is(volt, amp):
-    streams = power_streams({"battery": (STAMP_NS, volt, amp)}).tables
-    kept, repeats = remove_repeats(streams)
-    assert kept["power"] is streams["power"]
-    assert not repeats
 
 
 def test_clock_epochs_are_told_together_and_kept_apart():

@@ -63,12 +63,6 @@ def test_segments_of_a_run_without_gnss_are_outside_every_map():
     assert got.lost_by.tolist() == [Loss.OUTSIDE_MAP] * 2
 
 
-def test_no_segments_give_no_patches():
-    got = sample(drive([(500_001.0, 5_199_995.0)]).slice(0, 0), random_map())
-    assert got.patches.pixels["height"].shape == (0, 40, 40)
-    assert got.footprint_lonlat_deg.shape == (0, 4, 2)
-
-
 def test_chords_that_contradict_their_ends_are_refused():
     start = np.array([(500_001.0, 5_199_995.0)])
     to_lonlat = pyproj.Transformer.from_crs(CRS, "EPSG:4326", always_xy=True)
@@ -94,19 +88,6 @@ def test_a_wider_patch_is_centred_on_the_chord():
     one, two = (sample(segments, random_map(), patch_m=m, patch_px=px) for m, px in ((1.0, 40), (2.0, 80)))
     np.testing.assert_allclose(two.footprint_xy_m.mean(axis=1), one.footprint_xy_m.mean(axis=1), atol=1e-6)
     np.testing.assert_array_equal(two.patches.pixels["terrain"][0, 20:60, 20:60], one.patches.pixels["terrain"][0])
-
-
-def test_class_names_and_maps_without_classes():
-    source = random_map()
-    source.arrays["terrain"][:] = 5
-    segments = drive([(500_002.0, 5_199_990.0)])
-    got = sample(segments, source)
-    assert got.patches.terrain_class.tolist() == [5]
-    assert got.patches.terrain_purity.tolist() == [1.0]
-    bare = ArrayMap(source.grid, {"height": source.arrays["height"]})
-    got = sample(segments, bare)
-    assert got.kept.tolist() == [0]
-    assert list(got.patches.pixels) == ["height"]
 
 
 def test_pitches_that_do_not_fit_the_map_are_said():

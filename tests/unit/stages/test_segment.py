@@ -41,14 +41,6 @@ def test_a_hill_is_cut_by_its_horizontal_chord():
     assert rise == pytest.approx(np.tan(slope), abs=1e-6)
 
 
-def test_the_next_segment_starts_at_the_end_of_the_last():
-    table = cut(straight_track(np.full(len(T), 0.83))).table
-    assert (to_integers(table, "start_ns")[1:] == to_integers(table, "end_ns")[:-1]).all()
-    for axis in "xyz":
-        assert (to_floats(table, f"start_{axis}_m")[1:] == to_floats(table, f"end_{axis}_m")[:-1]).all()
-    assert table["segment_id"][0].as_py() == f"run-0123abcd-{table['start_ns'][0].as_py()}"
-
-
 def test_longitude_and_latitude_are_those_of_the_enu_position():
     datum = GRAZ
     table = cut(straight_track(np.full(len(T), 0.9), course_rad=0.4, slope_rad=0.1, datum=datum)).table
@@ -63,11 +55,6 @@ def test_longitude_and_latitude_are_those_of_the_enu_position():
         got = to_floats(table, f"{end}_lon_deg"), to_floats(table, f"{end}_lat_deg")
         _, _, apart = geod.inv(lon, lat, *got)
         assert np.max(apart) < 1e-6
-
-
-def test_a_local_frame_has_no_longitude():
-    table = cut(straight_track(np.full(len(T), 0.9))).table
-    assert table["start_lon_deg"].null_count == table.num_rows
 
 
 def test_kept_backward_stretches_never_share_a_segment_with_forward_ones():

@@ -1,7 +1,5 @@
 """The sampling kernel against scipy, symmetry, missing data, tiles."""
 
-from collections import Counter
-
 import numpy as np
 import pytest
 from map_worlds import ArrayMap, World, random_map
@@ -11,7 +9,6 @@ from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at, make_patch_frames, map_px_from_patch, sample_patches
 from tcpipe.terrain.target_grid import MapGrid
-from tcpipe.terrain.tiles import CACHED_TILES, TilePool, group_by_tile, read_tile_window
 
 
 def frames_at(grid, count, seed=1, margin_m=1.5, chord_m=1.0):
@@ -119,14 +116,6 @@ def test_patches_beyond_the_map_have_no_data_there():
     assert (got.pixels["height"][1] == 65535).all()
 
 
-def test_layers_that_a_map_lacks_are_absent():
-    source = random_map()
-    only = ArrayMap(source.grid, {"height": source.arrays["height"]})
-    got = sample(only, frames_at(source.grid, 5))
-    assert list(got.pixels) == ["height"]
-    assert got.terrain_class.tolist() == [0] * 5
-
-
 @pytest.mark.parametrize("tile_px", [16, 64, 512])
 def test_patches_in_the_maps_corners_are_those_of_a_larger_map(tile_px):
     """The last pixel of the last tile is the end of the memory that may be read."""
@@ -164,59 +153,6 @@ def test_each_tile_is_read_once_though_samples_come_in_any_order(rows, cols, mos
     assert len(set(seen)) == 3 * (rows // 64) * (cols // 64)
     assert len(seen) <= most * len(set(seen))
     np.testing.assert_array_equal(got.pixels["height"], sample(plain, frames).pixels["height"])
-
-
-def test_the_tile_pool_is_bounded_and_reads_again_what_it_let_go(monkeypatch):
-    source, read = random_map(rows=600, cols=600, tile_px=16), []
-    monkeypatch.setattr(
-        ArrayMap, "read_tile", lambda *given, to=ArrayMap.read_tile: (read.append(given[1:4]), to(*given))
-    )
-    pool = TilePool(source)
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        row, col = rng.integers(-20, 600, 2)
-        pool.hold(np.array([(row, col, row + 30, col + 40)]))
-        assert (pool.slots >= 0).sum() <= CACHED_TILES
-        for i, j in np.add(rng.integers(0, (30, 40), (20, 2)), (row, col)):
-            if 0 <= i < 600 and 0 <= j < 600:
-                slot = pool.slots[i // 16, j // 16]
-                at = (slot * 16 + i % 16) * 16 + j % 16
-                held = pool.tiles.relative[at], pool.tiles.greys[at], pool.tiles.classes[at]
-                assert list(held) == [layer[i, j] for layer in source.arrays.values()]
-    assert max(Counter(read).values()) > 1
-    pool.hold(np.array([(0, 0, 600, 600)]))  # more than it keeps: it grows for once
-    assert (pool.slots >= 0).all()
-
-
-def test_positions_are_grouped_by_tile_once_each():
-    source = random_map(rows=200, cols=900, tile_px=16)
-    px = np.random.default_rng(0).uniform(-5.0, 905.0, (5000, 2))
-    groups = list(group_by_tile(px, source))
-    assert sorted(np.concatenate(groups).tolist()) == list(range(5000))
-    cells = np.clip(px, 0, (899, 199)).astype(int) // 16
-    assert all(len(np.unique(cells[group], axis=0)) == 1 for group in groups)
-    assert len(groups) == len(np.unique(cells, axis=0))
-
-
-def test_windows_beyond_the_map_have_no_data_there():
-    source = random_map(rows=60, cols=50)
-    whole = read_tile_window(source, "ortho", -5, 65, -7, 53)
-    np.testing.assert_array_equal(whole[5:-5, 7:-3], source.arrays["ortho"])
-    assert not whole[:5].any()
-    assert np.isnan(read_tile_window(source, "height", 70, 75, 0, 5)).all()
-
-
-def test_good_patches_move_together():
-    source = random_map()
-    frames = frames_at(source.grid, 700)
-    whole, good = sample(source, frames), np.random.default_rng(0).random(700) < 0.8
-    good[:150] = True
-    got = sample(source, frames).keep_valid(good)
-    for name in ("ortho", "terrain", "height", "slope_rad", "terrain_class"):
-        np.testing.assert_array_equal(values(got, name), values(whole, name)[good])
-    assert list(sample(ArrayMap(source.grid, {"height": source.arrays["height"]}), frames).keep_valid(good).pixels) == [
-        "height"
-    ]
 
 
 WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=60.0)
