@@ -1,6 +1,5 @@
 """Pages in Chromium as a person has them: wide and on a phone, by day and by night (``make test-pages``; skipped without its parts)."""
 
-import shutil
 from pathlib import Path
 from time import monotonic
 
@@ -256,19 +255,6 @@ def test_ids_of_a_selection_open_these_samples(chromium, dataset, tmp_path, look
     assert len(copied) == shown
 
 
-def test_of_a_part_of_the_samples_the_page_says_what_a_selection_covers(chromium, dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr("tcpipe.report.dataset_report.MOST_SAMPLES", 30)
-    monkeypatch.setattr("tcpipe.report.pictures.MOST_PATCHES", 5)
-    shutil.copytree(dataset, tmp_path / "dataset")
-    report(tmp_path / "dataset")
-    with quiet_page(chromium, tmp_path / "dataset/report.html", LOOKS[0]) as tab:
-        tab.select_option("#run", label="north")
-        said = tab.locator("#selection-count").inner_text()
-        assert "The selection covers the 30 samples that the page shows, drawn at random from 144." in said
-        assert tab.get_by_text("not in this page").count() > 0
-        assert "tcpipe.open_dataset reads all" in tab.locator("#no-picture").inner_text()
-
-
 def test_a_selection_is_a_part_of_the_address(chromium, dataset):
     context = chromium.new_context(viewport={"width": 1280, "height": 900})
     tab = context.new_page()
@@ -284,28 +270,6 @@ def test_a_selection_is_a_part_of_the_address(chromium, dataset):
     again.wait_for_selector("html[data-ready]")
     assert again.evaluate(SELECTED) == chosen
     assert again.url == address
-    context.close()
-
-
-def test_a_finger_scrolls_the_page_and_selects_a_sample(chromium, dataset):
-    context = chromium.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
-    tab = context.new_page()
-    tab.goto((dataset / "report.html").as_uri())
-    tab.wait_for_selector("html[data-ready]")
-    identity = tab.evaluate("page.model('map').id")
-    place = tab.locator(f"#{identity}")
-    assert place.bounding_box()["y"] <= 700
-    place.scroll_into_view_if_needed()
-    tab.touchscreen.tap(*tab.evaluate(PLACE, ["map", *tab.evaluate(f"[{SOURCE}.data.x[3], {SOURCE}.data.y[3]]")]))
-    until(tab, f"{SOURCE}.selected.indices.length === 1")
-    box, before = place.bounding_box(), tab.evaluate("scrollY")
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    touch = context.new_cdp_session(tab)
-    touch.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [{"x": x, "y": y}]})
-    for step in range(1, 11):
-        touch.send("Input.dispatchTouchEvent", {"type": "touchMove", "touchPoints": [{"x": x, "y": y - 15 * step}]})
-    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-    until(tab, f"scrollY > {before} + 50")
     context.close()
 
 
@@ -482,16 +446,6 @@ FIRST_PLOT = """() => {
 }"""
 
 
-def test_a_click_shows_the_sample_without_scrolling(chromium, dataset):
-    with quiet_page(chromium, dataset / "report.html", (1400, "light")) as tab:
-        tab.mouse.click(*tab.evaluate(PLACE, ["map", column(tab, "x")[0], column(tab, "y")[0]]))
-        until(tab, f"{SELECTED}.length === 1")
-        shown = [tab.get_by_text(text).first for text in ("power w", "energy E", "where from")]
-        for part in (*shown, tab.locator("#chosen .patch").last):
-            box = part.bounding_box()
-            assert 0.0 < box["y"] < box["y"] + box["height"] < 900.0
-
-
 def test_a_value_has_as_many_decimals_as_its_uncertainty(chromium, dataset):
     with quiet_page(chromium, dataset / "report.html", LOOKS[0]) as tab:
         for call, text in {
@@ -504,14 +458,6 @@ def test_a_value_has_as_many_decimals_as_its_uncertainty(chromium, dataset):
             "NaN, 'J', 1, 2": "none",
         }.items():
             assert tab.evaluate(f"page.quantity({call})") == text
-
-
-@pytest.mark.parametrize("kind", ["run", "dataset", "evaluation", "store"])
-def test_on_a_phone_the_first_plot_follows_the_verdict(request, chromium, dataset, kind):
-    with quiet_page(chromium, find_page(kind, request, dataset), LOOKS[2]) as tab:
-        plot, verdict = tab.evaluate(FIRST_PLOT)[0], tab.locator(".grades").bounding_box()
-        assert plot < tab.locator(".numbers").bounding_box()["y"]
-        assert plot - verdict["y"] - verdict["height"] < 500.0
 
 
 @pytest.mark.parametrize("kind", ["run", "dataset", "evaluation", "store"])

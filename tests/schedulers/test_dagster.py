@@ -8,7 +8,6 @@ import json
 import os
 import shutil
 import sys
-import threading
 from pathlib import Path
 
 import pytest
@@ -177,57 +176,11 @@ def test_ten_thousand_logs_are_asked_for_a_hundred_at_a_time(defs, site, tmp_pat
     assert asked == [places[:100], places[100:200], places[200:] + places[:50], places[50:150]]
 
 
-def test_another_recipe_requests_a_log_again(defs, site, tmp_path, monkeypatch):
-    ingest([site / "logs"], store=site / "store")
-    (recipe := tmp_path / "recipe.toml").write_text("[segment]\nchord_m = 2.0\n")
-    with dg.DagsterInstance.ephemeral() as instance:
-        instance.add_dynamic_partitions("logs", ["tiny.mcap"])
-        assert not found(defs, instance).run_requests
-        monkeypatch.setenv("TCPIPE_RECIPE", str(recipe))
-        assert [request.partition_key for request in found(defs, instance).run_requests] == ["tiny.mcap"]
-
-
 def test_a_log_that_a_run_works_on_is_not_requested_again(defs, site):
     with dg.DagsterInstance.ephemeral() as instance:
         (request,) = found(defs, instance).run_requests
         instance.create_run_for_job(defs.resolve_job_def("one_log"), tags={"dagster/partition": request.partition_key})
         assert not found(defs, instance).run_requests
-
-
-def test_a_run_of_one_log_looks_at_no_other(module, site, monkeypatch):
-    calls, run_command = [], module._run_command
-    monkeypatch.setattr(
-        module, "_run_command", lambda log, *words, **how: (calls.append(words), run_command(log, *words, **how))[1]
-    )
-    with dg.DagsterInstance.ephemeral() as instance:
-        instance.add_dynamic_partitions("logs", list(map(str, range(1000))))
-        assert ingest_one(module.defs, instance).success
-    assert [(words[0], words[1].removeprefix(f"{site / 'logs'}/").split("-")[0]) for words in calls] == [
-        ("ingest", "tiny.mcap"),
-        ("verify", "tiny"),
-    ]
-
-
-def test_progress_is_logged_when_it_comes(module, command, tmp_path):
-    """The program ends only when its first line was logged."""
-    go = tmp_path / "go"
-    command(
-        "import sys, time, pathlib\n"
-        f"print('reading', file=sys.stderr, flush=True)\ngo = pathlib.Path({str(go)!r})\n"
-        "while not go.exists(): time.sleep(0.01)\n"
-        """print('{"kind": "log"}\\n{"kind": "summary", "results": []}')"""
-    )
-    lines, answers = [], []
-
-    class Log:
-        def info(self, line):
-            lines.append(line)
-            go.touch()
-
-    thread = threading.Thread(target=lambda: answers.append(module._run_command(Log(), "ingest")), daemon=True)
-    thread.start()
-    thread.join(60)
-    assert (lines, [answer.result["kind"] for answer in answers]) == (["reading"], ["summary"])
 
 
 @pytest.mark.parametrize(

@@ -3,19 +3,10 @@
 import string
 
 import pytest
-from click.testing import CliRunner
 from installed_command import tcpipe
 from synthetic_store import small_store
 
-from tcpipe.cli import _COMMANDS, _GROUPS, _NEXT_STEPS, cli
-
-
-def test_help_lists_four_groups_and_the_simulations_last():
-    lines = CliRunner().invoke(cli, ["--help"]).output.splitlines()
-    places = [lines.index(f"{title}:") for title in _GROUPS]
-    assert len(places) == 4
-    assert places == sorted(places)
-    assert [line.split()[0] for line in lines[-2:]] == ["simulate", "reproduce"]
+from tcpipe.cli import _COMMANDS, _NEXT_STEPS, cli
 
 
 @pytest.mark.parametrize("name", _NEXT_STEPS)

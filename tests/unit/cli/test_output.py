@@ -39,17 +39,6 @@ def test_without_a_terminal_each_stage_of_a_log_is_one_line(capsys):
     assert capsys.readouterr() == ("", "a.bag: reading\na.bag: fusing\n")
 
 
-def test_a_stage_is_told_hundredth_by_hundredth_and_never_beyond_its_end(caplog):
-    with caplog.at_level(logging.DEBUG, "tcpipe"), set_task("a.bag"):
-        meter = Meter("reading", 1000)
-        for _ in range(4000):
-            meter.add(0.5)
-    done = [record.args[2] for record in caplog.records]
-    assert len(done) == 200
-    assert done[:3] == [10, 20, 30]
-    assert max(done) == 1000
-
-
 @pytest.mark.parametrize(
     ("as_json", "of_stdout", "drawn"), [(True, True, False), (True, False, True), (False, True, True)]
 )
@@ -126,31 +115,9 @@ def test_a_log_under_way_has_its_name_stage_and_bytes_and_all_have_a_count_rate_
     assert "a.bag" not in drawn()
 
 
-def test_what_needed_no_work_says_nothing_of_the_rate(screen):
-    shown, drawn = screen
-    shown.expect({"a": 600 * MB, "b": 40 * MB})
-    shown.end("a", worked=False)
-    assert "1/2" in drawn()
-    assert "MB/s" not in drawn()
-
-
 def test_a_name_is_shown_as_text(screen):
     shown, drawn = screen
     shown.expect({HOSTILE: MB})
     shown.step(Step(HOSTILE, "fusing", 0, 0))
     assert all(c.isprintable() or c == "\n" for c in drawn())
     assert "[red]a\\x1b" in drawn()
-
-
-def test_a_bar_fills_from_part_to_part_and_within_each(capsys):
-    with Progress("demo", quiet=False, console=Console(force_terminal=True, file=io.StringIO())) as shown:
-        done = []
-        for number, text in enumerate(("simulating", "ingesting")):
-            shown.begin_part(number, total=2, text=text)
-            done.append(shown._bars.tasks[0].completed)
-            shown.step(Step("a.bag", "reading", 30, 100))
-            done.append(shown._bars.tasks[0].completed)
-    assert done == [0, 0.3, 1, 1.3]
-    with Progress("demo", quiet=False, console=None) as shown:
-        shown.begin_part(0, total=2, text="simulating")
-    assert capsys.readouterr() == ("", "simulating\n")

@@ -9,8 +9,6 @@ from tcpipe.dataset.extra_features import (
     COLUMNS,
     ExtraFeature,
     ExtraFeatures,
-    append_column_planes,
-    append_planes,
     available_features,
     empty_extra_features,
     read_extra_features,
@@ -55,17 +53,3 @@ def test_numbers_are_deviations_and_what_is_not_known_is_usual():
     extra_features = ExtraFeatures(np.zeros(2, int), np.zeros(2), np.array([0.2, np.nan]), np.array([np.nan, 0.6]))
     assert standardize_features([TURN, SPEED], extra_features) == pytest.approx(np.array([[2.0, 0.5], [0.0, -1.0]]))
     assert standardize_features([], extra_features).shape == (2, 0)
-
-
-def test_each_number_is_a_channel_of_one_value():
-    patches = np.zeros((2, 3, 3, 1), np.float32)
-    found = append_planes(patches, np.array([[2.0, 0.5], [0.0, -1.0]]))
-    assert found.shape == (2, 3, 3, 3)
-    assert found[0, :, :, 1:].reshape(-1, 2) == pytest.approx(np.tile([2.0, 0.5], (9, 1)))
-    assert append_planes(patches, np.empty((2, 0))) is patches
-
-
-def test_planes_of_a_batch_are_made_from_its_columns():
-    columns = np.array([[0.2, 1.5, 1.5, np.nan], [np.nan, 1.0, 1.0, 0.6]], np.float32)
-    found = append_column_planes([TURN, SPEED], np.zeros((2, 3, 3, 1), np.float32), columns)
-    assert found[:, 1, 1, 1:] == pytest.approx(np.array([[2.0, 0.5], [0.0, -1.0]]), abs=1e-6)

@@ -313,10 +313,3 @@ def test_torch_iterates_over_every_sample_once(path, workers, from_disk):
     for seen in epochs:
         np.testing.assert_array_equal(seen[np.lexsort(seen.T)], train.labels[np.lexsort(train.labels.T)])
     assert not np.array_equal(*epochs)
-
-
-def test_parts_share_nothing_and_leave_nothing_out(train):
-    batches = train.batches(32, from_disk=True)
-    parts = [[float(power) for _, labels in batches.part(number, 3) for power in labels[:, 0]] for number in range(3)]
-    whole = [float(power) for _, labels in batches for power in labels[:, 0]]
-    assert sorted(itertools.chain(*parts)) == sorted(whole)

@@ -60,14 +60,6 @@ def test_the_mean_of_each_class_by_hand(found, sets):
     assert row.errors.count == len(test.split)
 
 
-def test_two_runs_are_too_few_so_blocks_of_ground_are_drawn(found, sets):
-    rows, _ = found
-    test = sets[1]["test"].split
-    row = next(row for row in rows if row.split == "test")
-    assert row.drawn_by == "blocks"
-    assert 1 < row.groups < len(test)
-
-
 def test_a_model_is_not_its_own_baseline(sets):
     data, parts = sets
     rows, _ = compare_baselines(model_of("boosting"), data, parts, said_by(parts), seed=0)

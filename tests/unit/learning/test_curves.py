@@ -39,14 +39,3 @@ def test_three_samples_of_a_class_shift_its_curve_and_do_not_bend_it():
     said = curves.predict(at, np.full(3, 5))[:, 0] - (100.0 + 300.0 * at)
     assert 2.0 < said[1] < 30.0
     assert np.abs(said).max() < 40.0
-
-
-@pytest.mark.parametrize("quantiles", [(), (1 / 3, 2 / 3)])
-def test_flat_ground_and_equal_labels_are_their_value(quantiles):
-    curves = fit_curves(np.zeros(40), np.full(40, 4), np.full((40, 2), 7.0), quantiles=quantiles)
-    assert curves.predict(np.array([0.0, 0.1]), np.array([4, 9])) == pytest.approx(np.full((2, 2), 7.0))
-
-
-def test_a_single_sample():
-    curves = fit_curves(np.array([0.1]), np.array([4]), np.array([[120.0]]))
-    assert curves.predict(np.array([0.1, -0.2]), np.array([4, 4]))[:, 0] == pytest.approx(120.0)

@@ -152,14 +152,6 @@ def test_what_is_ablated_is_noise_and_nothing_else(model, dataset):
     assert predict_costs(ours, test).costs["w"] == pytest.approx(ours.predict(test.patches).mean[:, 0], rel=1e-5)
 
 
-def test_seven_input_sets(evaluated):
-    _, values = evaluated
-    rows = {"".join(row.layers): row for row in values.ablation}
-    assert list(rows) == ["OCH", "CH", "OH", "OC", "O", "C", "H"]
-    assert rows["OCH"].errors["test"]["w"] == values.splits["test"].errors["w"]["all"]
-    assert rows["O"].errors["test"]["w"] != rows["OCH"].errors["test"]["w"]
-
-
 def test_its_files_say_the_same(evaluated):
     place, values = evaluated
     assert json.loads((place / "evaluation.json").read_text()) == to_plain(values)
@@ -243,24 +235,6 @@ def test_a_folder_of_something_else_is_left_alone(model, dataset, tmp_path):
     (tmp_path / "thesis.txt").write_text("important")
     with pytest.raises(UsageError, match="exists and is no evaluation"):
         run_evaluation(model, dataset, tmp_path, config=CONFIG)
-
-
-@pytest.mark.usefixtures("served")
-def test_it_goes_to_a_bucket_and_another_one_is_the_next_build(evaluated, model, dataset, tmp_path, monkeypatch):
-    place, values = evaluated
-    table, url = read_table(place / "predictions.parquet"), "s3://tests/by me"
-    monkeypatch.setattr(
-        "tcpipe.learning.evaluation_files.evaluate", lambda *_, key, **__: (replace(values, key=key), table)
-    )
-    told = run_evaluation(model, dataset, url, config=CONFIG)
-    (there,) = (tmp_path / "served" / "tests" / "by me" / "builds").iterdir()
-    assert str(told).endswith(f"open {url}/builds/{there.name}/evaluation.html")
-    for name in ("evaluation.json", "evaluation.html", "predictions.parquet"):
-        assert (there / name).read_bytes() == (place / name).read_bytes()
-    assert run_evaluation(model, dataset, url, config=CONFIG).values == told.values
-    other = run_evaluation(model, dataset, url, config=replace(CONFIG, seed=1))
-    assert other.path not in (told.path, url)
-    assert len(list(there.parent.iterdir())) == 2
 
 
 def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 from installed_command import plain_lines, tcpipe
 from synthetic_store import add_run, box, lanes, lonlat, open_world, region_file, segments
 
-from tcpipe.dataset import Split, open_dataset
+from tcpipe.dataset import Split
 from tcpipe.errors import DatasetError
 from tcpipe.learning.evaluation import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
@@ -62,21 +62,6 @@ def test_heights_alone_are_enough(bare, tmp_path, kind):
             tcpipe("predict-path", "model", "--path", "away.geojson", "--store", bare / "store", cwd=tmp_path), 1
         )
         assert "is not on map site" in lines
-
-
-@pytest.mark.parametrize("kind", ["boosting", "physics"])
-def test_three_samples_of_a_class_are_enough_to_be_told_something(dataset, tmp_path, kind, monkeypatch):
-    three = real_column(open_dataset(dataset)["train"], "sample_id")[:3]
-
-    def column(split, name):
-        found = real_column(split, name)
-        return np.where(np.isin(real_column(split, "sample_id"), three), 1, found) if name == "terrain_class" else found
-
-    monkeypatch.setattr(Split, "column", column)
-    train(dataset, tmp_path / "model", config=FitConfig(model=kind))
-    assert load_model(tmp_path / "model").card.training_range.class_counts[1] == 3
-    values = run_evaluation(tmp_path / "model", dataset, tmp_path / "evaluation", config=CONFIG).values
-    assert np.isfinite([row.errors.rmse for row in values.baselines]).all()
 
 
 @pytest.mark.parametrize("kind", ["boosting", "physics"])

@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from stored_files import flip
 
 from tcpipe.errors import ModelError, UsageError
 from tcpipe.formats.integrity import write_sealed
-from tcpipe.formats.published_outputs import write_output
 from tcpipe.learning.models import WEIGHTS, load_model
 from tcpipe.pipeline.verify import verify
 
@@ -104,16 +101,6 @@ def test_an_edited_card_is_refused_and_every_damaged_file_is_named(tmp_path):
     _refused(place, r"model\.json: has changed since it was written.*; remove the folder and train the model again")
 
 
-def test_a_card_is_read_without_torch(place):
-    program = f"""
-import sys
-from tcpipe.learning.models import load_model
-assert load_model({str(place)!r}).card.training_range.class_counts == {{4: 60, 6: 25, 7: 15}}
-assert "torch" not in sys.modules
-"""
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
 def test_without_torch_there_is_one_line(place, monkeypatch):
     monkeypatch.setattr("tcpipe.learning.network_model.find_spec", lambda _: None)
     with pytest.raises(ModelError, match=r"torch not installed, .* pip install 'tcpipe\[train\]'"):
@@ -127,19 +114,3 @@ def test_a_changed_byte_is_found_and_its_file_is_named(tmp_path, place, name):
     flip(model / name)
     (problem,) = verify(model).problems
     assert str(model / name) in problem
-
-
-def test_what_does_not_belong_to_a_model_is_named(tmp_path, place):
-    model = Path(shutil.copytree(place, tmp_path / "model"))
-    (model / "mine.txt").touch()
-    assert verify(model).problems == (f"{model / 'mine.txt'}: is no file of this model",)
-
-
-@pytest.mark.usefixtures("served")
-def test_a_model_in_a_bucket_is_the_one_on_disk(place):
-    with write_output("s3://tests/a b", "model.json") as directory:
-        shutil.copytree(place, directory, dirs_exist_ok=True)
-    there = load_model("s3://tests/a b")
-    assert (there.checksum, there.name) == (load_model(place).checksum, "s3://tests/a b")
-    with pytest.raises(UsageError, match="no dataset, model or cost map here"):
-        load_model("s3://tests/other")

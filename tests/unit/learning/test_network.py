@@ -28,35 +28,6 @@ def test_both_readings_of_equation_4_by_hand(loss, lengths):
     assert found == pytest.approx(np.mean(lengths), rel=1e-6)
 
 
-@pytest.mark.parametrize("loss", ["nrmse", "paper_eq4"])
-def test_tensors_of_torch_have_the_same_loss_and_its_gradient(loss):
-    factors = compute_loss_factors(loss, SCALE)
-    errors = PREDICTED - LABELS
-    lengths = np.sqrt((errors**2 * factors).sum(axis=1))
-    assert mean_loss(PREDICTED, LABELS, factors) == pytest.approx(lengths.mean(), rel=1e-6)
-    said = torch.from_numpy(PREDICTED).requires_grad_()
-    told = mean_loss(said, *map(torch.from_numpy, (LABELS, factors)))
-    told.backward()
-    assert told.item() == pytest.approx(lengths.mean(), rel=1e-6)
-    slope = errors * factors / lengths[:, None] / len(LABELS)
-    assert said.grad.numpy() == pytest.approx(slope, rel=1e-6)
-
-
-def test_odd_batches_of_a_narrow_network_on_two_threads():
-    """With 8 filters this ends the process: "corrupted size vs. prev_size" (torch 2.13.0)."""
-    from tcpipe.learning.network import Trainer, make_resnet18
-
-    trainer = Trainer(make_resnet18(1, 1, 16, seed=0, start=[0.5]), np.ones(1, np.float32))
-    rng, threads = np.random.default_rng(0), torch.get_num_threads()
-    torch.set_num_threads(2)
-    losses = [
-        trainer.step(rng.random((count, 40, 40, 1), np.float32), rng.random((count, 1), np.float32), 1e-3)
-        for count in (11, 35, 3)
-    ]
-    torch.set_num_threads(threads)
-    assert np.isfinite(losses).all()
-
-
 @pytest.mark.parametrize("size", [1, 1_000, 100_000])
 def test_a_state_for_which_there_is_no_room_is_one_error_that_names_it(tmp_path, size):
     from tcpipe.learning.network import Trainer, make_resnet18
@@ -93,14 +64,3 @@ def test_first_weights_are_he_s_of_the_seed():
     assert one[kernel].var() == pytest.approx(2.0 / (9 * 128), rel=0.02)
     assert np.abs(one[kernel]).max() <= 2.0 * np.sqrt(2.0 / (9 * 128)) / 0.8796
     assert one["head.bias"] == pytest.approx([0.4, 0.8])
-
-
-def test_a_batch_of_one_sample_of_one_pixel_is_trained_on():
-    """The last stage sees a patch of 16 pixels as one, of which a batch normalisation has no deviation."""
-    from tcpipe.learning.network import Trainer, make_resnet18
-
-    trainer = Trainer(make_resnet18(1, 1, 16, seed=0, start=[0.5]), np.ones(1, np.float32))
-    patch, label = np.full((1, 16, 16, 1), 0.5, np.float32), np.array([[0.7]], np.float32)
-    losses = [trainer.step(patch, label, 1e-2) for _ in range(5)]
-    assert losses[0] == pytest.approx(0.2, abs=0.1)
-    assert min(losses[1:]) < losses[0]

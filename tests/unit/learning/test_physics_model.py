@@ -7,7 +7,7 @@ import pytest
 
 from tcpipe.dataset.extra_features import ExtraFeatures
 from tcpipe.errors import ModelError
-from tcpipe.learning.physics_model import PhysicsModel, fit_physics_model
+from tcpipe.learning.physics_model import fit_physics_model
 
 COUNT = 600
 
@@ -65,15 +65,6 @@ def test_without_turns_in_the_data_there_is_no_term_for_them():
     extra_features, labels = drive()
     blind = replace(extra_features, turn_radpm=np.full(COUNT, np.nan))
     assert not fit_physics_model(blind, labels, idle_watt=None).turning_joule_per_rad.any()
-
-
-def test_arrays_there_and_back():
-    extra_features, labels = drive()
-    model = fit_physics_model(extra_features, labels, idle_watt=50.0)
-    again = PhysicsModel.from_arrays(model.to_arrays(), None)
-    assert _predict(again, extra_features) == pytest.approx(_predict(model, extra_features), abs=0.0)
-    with pytest.raises(ModelError, match="weights of another model"):
-        PhysicsModel.from_arrays({"feature": np.zeros(3)}, None)
 
 
 def test_too_few_samples_are_said():

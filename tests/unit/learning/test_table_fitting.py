@@ -1,9 +1,6 @@
 """A table is a model folder like any other: trained in a moment, asked, evaluated, replaced."""
 
-import json
 import re
-from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +11,6 @@ from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import HISTORY, WEIGHTS, load_model
 from tcpipe.learning.training import train
 from tcpipe.pipeline.verify import verify
-from tcpipe.planning.cost_model import predict_patches
 
 pytest.importorskip("lightgbm")
 
@@ -54,24 +50,6 @@ def test_the_same_again_is_nothing_to_do_and_the_same_bytes(trained, dataset, tm
     train(dataset, tmp_path / "model", config=CONFIG)
     for name in (WEIGHTS, HISTORY, "residuals.parquet"):
         assert (tmp_path / "model" / name).read_bytes() == (trained[0] / name).read_bytes()
-
-
-def test_one_layer(dataset, tmp_path):
-    train(dataset, tmp_path / "height", config=replace(CONFIG, layers=("height",)))
-    assert load_model(tmp_path / "height").card.inputs.channels == ("height",)
-
-
-def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):
-    done = tcpipe("train", dataset, "model", "--model", "boosting", "--json", cwd=tmp_path)
-    assert json.loads(done.stdout)["model"] == "boosting"
-    assert (tmp_path / "model" / WEIGHTS).read_bytes() == (trained[0] / WEIGHTS).read_bytes()
-    model, split = load_model(tmp_path / "model"), open_dataset(dataset)["train"]
-    pixels = split.layers(np.arange(20))
-    asked = np.arange(20) != 3
-    ground = {name: split.column(name)[:20] for name in ("terrain_class", "slope_rad")}
-    said = predict_patches(model, SimpleNamespace(pixels=pixels, **ground), asked, np.full(20, np.nan))
-    assert np.isnan(said.mean[3, 0])
-    assert said.mean[asked, 0] == pytest.approx(model.predict(split.patches[:20]).mean[asked, 0])
 
 
 def test_settings_of_the_recipe_rule_the_trees_and_options_of_the_command_the_network(dataset, tmp_path):

@@ -47,16 +47,6 @@ def test_shares_of_classes_and_the_picture():
     assert found == pytest.approx([0.25, 0.25, 0.5, 0, 0, 0, 0.25, 0, 0, 0.75, 0.25, 0, 0])
 
 
-def test_a_mirror_changes_nothing():
-    patches = np.random.default_rng(0).random((5, PX, PX, 3), np.float32)
-    patches[..., 1] = np.rint(patches[..., 1] * 6) / 6
-    rules = {"channels": ("ortho", "terrain", "height"), "class_count": 7, "patch_m": PATCH_M}
-    assert compute_patch_features(patches[:, ::-1], **rules) == pytest.approx(
-        compute_patch_features(patches, **rules), abs=1e-5
-    )
-    assert compute_patch_features(patches[:0], **rules).shape == (0, 16)
-
-
 RULES = forest.make_rules(TrainConfig())
 
 

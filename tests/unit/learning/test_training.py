@@ -1,7 +1,6 @@
 """Training: seeded, stopped by a fold of train, gone on from a checkpoint as if nothing had happened."""
 
 import csv
-import io
 import shutil
 from dataclasses import replace
 
@@ -137,36 +136,6 @@ def test_a_training_stopped_after_any_checkpoint_goes_on_as_if_nothing_had_happe
     assert not checkpoint.exists()
 
 
-def test_an_interruption_in_the_middle_of_an_epoch_loses_that_epoch_alone(trained, dataset, tmp_path, monkeypatch):
-    from tcpipe.learning.network import Trainer
-
-    real, count, place = Trainer.step, [], tmp_path / "model"
-
-    def stop_in_the_third_epoch(trainer, *batch):
-        count.append(batch)
-        if len(count) == steps * 2 + 1:
-            raise KeyboardInterrupt
-        return real(trainer, *batch)
-
-    steps = -(-load_model(trained[0]).card.training.samples["fitted"] // CONFIG.batch_size)
-    monkeypatch.setattr(Trainer, "step", stop_in_the_third_epoch)
-    with pytest.raises(KeyboardInterrupt):
-        train(dataset, place, config=CONFIG)
-    monkeypatch.setattr(Trainer, "step", real)
-    kept = torch.load(io.BytesIO(_checkpoint(place).read_bytes()[32:]), weights_only=True)
-    assert kept["progress"]["epoch"] == 2
-    assert train(dataset, place, config=CONFIG).status == "done"
-    assert _same(_weights(trained[0]), _weights(place))
-
-
-def test_a_held_out_loss_that_is_no_number_is_gone_on_from(dataset, tmp_path, monkeypatch):
-    config = replace(CONFIG, epochs=2)
-    with monkeypatch.context() as patch:
-        patch.setattr(network_model, "compute_held_loss", lambda *_, **__: float("nan"))
-        _stopped(monkeypatch, 1, dataset, tmp_path / "model", config)
-    assert train(dataset, tmp_path / "model", config=config).best_epoch == 2
-
-
 def test_a_state_of_another_training_is_kept_and_one_cut_short_is_told(dataset, tmp_path, monkeypatch):
     place, config = tmp_path / "other", replace(CONFIG, epochs=1)
     _stopped(monkeypatch, 0, dataset, place, config)
@@ -213,16 +182,6 @@ def test_what_lies_beside_a_model_is_not_replaced_with_it(trained, dataset, tmp_
     with pytest.raises(UsageError, match=r"contains notes.txt in the directory of a model"):
         train(dataset, place, config=replace(CONFIG, seed=1))
     assert (place / "notes.txt").exists()
-
-
-def test_a_damaged_model_is_trained_again_by_the_same_command(trained, dataset, tmp_path, monkeypatch):
-    place = tmp_path / "model"
-    shutil.copytree(trained[0], place)
-    (place / WEIGHTS).write_bytes((place / WEIGHTS).read_bytes()[:-100])
-    monkeypatch.chdir(place)
-    assert train(dataset, ".", config=CONFIG).status == "done"
-    assert _same(_weights(trained[0]), _weights(place))
-    assert not list(tmp_path.glob("*.checkpoint"))
 
 
 def test_pixels_without_data_are_not_seen(dataset, monkeypatch):

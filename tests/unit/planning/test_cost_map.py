@@ -17,9 +17,8 @@ from ruamel.yaml import YAML
 from stored_files import flip
 
 from tcpipe.errors import MapError, ModelError, UsageError
-from tcpipe.formats.published_outputs import fetch_directory
 from tcpipe.pipeline.verify import verify
-from tcpipe.planning.cost_grid import ANGLES_DEG, iterate_blocks, make_grid
+from tcpipe.planning.cost_grid import ANGLES_DEG
 from tcpipe.planning.cost_map import make_cost_map, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import Reason
 from tcpipe.terrain.target_grid import MapGrid
@@ -76,16 +75,6 @@ def test_every_tile_is_decoded_once(made):
         of for of in source.reads if of[1] % 64 == 0 and of[2] % 64 == 0
     ]  # the others are single classes, of cells
     assert len(tiles) == 3 * 16
-
-
-@pytest.mark.parametrize("strip", [1, 2, 29])
-def test_blocks_hold_every_wanted_cell_once(monkeypatch, strip):
-    monkeypatch.setattr("tcpipe.planning.cost_grid._STRIP_TILES", strip)
-    source = plane(side_m=30.0)
-    grid = make_grid(source, 0.7)
-    wanted = np.random.default_rng(0).random((grid.rows, grid.cols)) < 0.6
-    cells = np.concatenate(list(iterate_blocks(source, MODEL, grid, wanted)))
-    assert sorted(cells) == np.flatnonzero(wanted).tolist()
 
 
 def test_bands_say_what_they_are_and_the_last_four_sum_up_the_courses(made):
@@ -333,17 +322,3 @@ def test_the_nav2_frame_begins_at_the_robots_datum_and_nothing_is_predicted_anew
     assert make_cost_map(MODEL, source, out, cell_size_m=2.0, origin_deg=lonlat).status == "unchanged"
     with pytest.raises(UsageError, match=r"km from map .*; give LON,LAT \(longitude first\)"):
         make_cost_map(MODEL, source, out, cell_size_m=2.0, origin_deg=lonlat[::-1])
-
-
-def test_a_cost_map_goes_to_a_bucket_and_another_one_is_the_next_build(made, tmp_path, served):
-    source, result = made
-    source = replace(source, reads=Counter())
-    (tmp_path / "served" / "maps").mkdir(parents=True)
-    told = make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=1.0)
-    assert (told.path, told.status, told.card.checksums) == ("s3://maps/of a site", "done", result.card.checksums)
-    there = open_cost_map(fetch_directory("s3://maps/of a site"), told.card)
-    np.testing.assert_array_equal(there.power_watt, open_cost_map(Path(result.path), result.card).power_watt)
-    assert make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=1.0).status == "unchanged"
-    other = make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=2.0)
-    assert other.status == "done"
-    assert read_cost_map_card(fetch_directory("s3://maps/of a site")) == other.card

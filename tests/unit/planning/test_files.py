@@ -17,9 +17,8 @@ from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.geojson import make_line_feature, read_line
 from tcpipe.formats.json_files import write_json
 from tcpipe.planning.cost_map import make_cost_map
-from tcpipe.planning.path_files import find_doubts, make_summary_path, plan, predict_path
+from tcpipe.planning.path_files import make_summary_path, plan, predict_path
 from tcpipe.planning.path_options import PlanPathOptions
-from tcpipe.tables.findings import Subject
 
 MODEL = PhysicsModel(patch_px=8)
 
@@ -55,13 +54,6 @@ def test_the_table_is_the_same_in_every_format(source, path, ending):
     if ending == "geojson":  # the lines join up
         lines = [feature["geometry"]["coordinates"] for feature in json.loads(out.read_text())["features"]]
         assert all(one[1] == other[0] for one, other in pairwise(lines))
-
-
-def test_bends_on_trusted_ground_are_no_warning(source, tmp_path):
-    _write_path(tmp_path / "bend.geojson", lonlat(source, (4.0, 4.0), (8.5, 4.0), (8.5, 8.0)))
-    found = predict_path(MODEL, source, tmp_path / "bend.geojson", None)
-    assert found.reasons == {"curved": 1}
-    assert [of.severity for of in find_doubts(found, Subject("file", "bend"))] == ["note"]
 
 
 def test_a_path_that_leaves_the_map_is_done_in_part(source, tmp_path):
@@ -136,17 +128,6 @@ def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(sour
         plan(replace(MODEL, checksum="1" * 64), source, _request(source, cost_map=costs, out=tmp_path / "p.json"))
     with pytest.raises(UsageError, match="not a cost map"):
         plan(MODEL, source, _request(source, cost_map=tmp_path, out=tmp_path / "p.json"))
-
-
-def test_a_cost_map_of_other_cells_gives_another_plan_and_a_damaged_one_is_refused(source, tmp_path):
-    costs, out = tmp_path / "costs", tmp_path / "plan.geojson"
-    request = _request(source, cost_map=costs, out=out)
-    for cell_size_m in (2.0, 3.0):
-        card = make_cost_map(MODEL, source, costs, cell_size_m=cell_size_m).card
-        assert plan(MODEL, source, request).predicted_cells == card.cells.all
-    (costs / "cost-map.json").write_text("{}")
-    with pytest.raises(ModelError, match="has changed since it was written"):
-        plan(MODEL, source, request)
 
 
 def test_files_of_the_user_are_left_alone(source, path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from physics_model import PhysicsModel, energy_joule, made_residuals, velocity_mps
+from physics_model import PhysicsModel, energy_joule, velocity_mps
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import ModelError, PathError
@@ -121,12 +121,6 @@ def test_a_bend_sharper_than_any_segment_is_marked_and_paid_along_its_arc():
     assert bent.totals.reasons == {}, "a model of curved segments knows bends"
 
 
-def test_without_held_out_samples_there_are_no_intervals():
-    found = _cost(plane(), (4.0, 4.0), (9.0, 4.0), model=replace(MODEL, residuals=made_residuals(5)))
-    assert found.totals.energy_interval_joule is None
-    assert found.path_segments.column("energy_low_joule").null_count == found.path_segments.num_rows
-
-
 class _Stuck(PhysicsModel):
     def predict(self, patches, extra_features):
         said = super().predict(patches, extra_features)
@@ -205,19 +199,6 @@ def test_a_metre_is_a_metre_of_ground_where_the_map_is_out_of_scale():
     assert segments.arc_m.sum() == pytest.approx(9.996)
 
 
-def test_round_a_corner_the_chord_is_a_metre_and_the_arc_is_longer():
-    segments = cut_path(np.array([[0.0, 0.0], [1.5, 0.0], [1.5, 5.0]]), chord_m=1.0, scale=1.0)
-    np.testing.assert_allclose(segments.end_xy_m[1], [1.5, np.sqrt(0.75)])
-    assert segments.arc_m[1] == pytest.approx(0.5 + np.sqrt(0.75))
-    assert segments.arc_m.sum() == pytest.approx(6.5)
-
-
-def test_the_patch_of_a_short_rest_ends_with_it_and_is_a_metre_long():
-    frames = cut_path(np.array([[0.0, 0.0], [1.4, 0.0]]), chord_m=1.0, scale=1.0).frames(1.0)
-    np.testing.assert_allclose(frames.centre_xy_m[:, 0], [0.5, 0.9])
-    np.testing.assert_allclose(frames.along_xy, [[1.0, 0.0], [1.0, 0.0]])
-
-
 @given(st.lists(_POINT, min_size=2, max_size=12, unique=True))
 def test_segments_join_up_and_add_up_to_the_path(points):
     xy = np.array(points)
@@ -232,9 +213,3 @@ def test_segments_join_up_and_add_up_to_the_path(points):
             segments.arc_m.sum() == pytest.approx(length, abs=2e-3)
             or np.linalg.norm(xy[-1] - segments.end_xy_m[-1]) <= 1e-3
         )
-
-
-def test_points_that_repeat_change_nothing():
-    path = np.array([[0.0, 0.0], [0.7, 0.0], [0.7, 0.0], [2.5, 0.3]])
-    once, twice = (cut_path(points, chord_m=1.0, scale=1.0) for points in (path[[0, 1, 3]], path))
-    np.testing.assert_array_equal(once.end_xy_m, twice.end_xy_m)

@@ -172,14 +172,6 @@ def test_no_way_says_what_would_open_one():
     assert found.totals.reasons["class_outside_training"] >= 3
 
 
-def test_an_end_outside_the_training_range_is_an_error_before_all_the_map_is_predicted():
-    source = plane(40.0, classes=lambda east, _: np.where(east > 30.0, 5, 4))
-    survey = make_survey(replace(MODEL, class_counts={4: 100}, pixel_classes=(4,)), source, 1.0)
-    with pytest.raises(PathError, match=r"--to: .*class outside training.*--allow-extrapolation"):
-        _plan(source, (22.0, 4.0), (33.0, 4.0), "time", survey=survey)
-    assert 0.0 < survey.predicted.mean() < 0.5
-
-
 def test_a_model_that_takes_no_classes_keeps_to_what_the_map_s_own_allow():
     source = plane(30.0, classes=_wall)
     model = replace(MODEL, channels=("height",), classes=ClassTable((TerrainClass(1, "all", traversable=True),)))
@@ -187,10 +179,3 @@ def test_a_model_that_takes_no_classes_keeps_to_what_the_map_s_own_allow():
     assert found.totals.complete
     assert found.totals.length_m > 40.0
     assert set(found.totals.reasons) <= {"curved"}
-
-
-def test_a_model_of_heights_alone_needs_no_other_layer():
-    source = plane(30.0, rise_east=0.3)
-    del source.arrays["ortho"], source.arrays["terrain"]
-    survey = make_survey(replace(MODEL, channels=("height",)), source, 2.0)
-    assert all(_plan(source, (4.0, 4.0), (26.0, 20.0), name, survey=survey).totals.complete for name in OBJECTIVES)

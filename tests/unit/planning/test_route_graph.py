@@ -13,7 +13,7 @@ from planning_worlds import NORTH_M, WEST_M, lonlat, plane
 from shared_data import shared_data
 
 from tcpipe.errors import PathError, UsageError
-from tcpipe.formats.maps.nav2 import RouteEdge, RouteGraph, read_route_graph
+from tcpipe.formats.maps.nav2 import read_route_graph
 from tcpipe.planning.path_cost import compute_path_cost
 from tcpipe.planning.route_graph import write_route_graph
 from tcpipe.terrain.target_grid import MapGrid
@@ -202,11 +202,3 @@ def test_graphs_of_the_format_and_those_of_nav2_are_read_and_written_whole(name,
         feature["properties"].pop("metadata", None)
         before[number]["properties"].pop("metadata", None)
         assert feature == before[number]
-
-
-def test_edges_back_have_new_ids():
-    edges = tuple(RouteEdge(number, start, end, {}) for number, start, end in ((3, 0, 1), (4, 1, 0), (5, 1, 2)))
-    graph = RouteGraph({}, [], {0: (0.0, 0.0), 1: (5.0, 0.0), 2: (9.0, 0.0)}, edges)
-    back = graph.list_missing_reverses()
-    assert [(of.edge_id, of.start, of.end) for of in back] == [(6, 2, 1)]
-    assert back[0].feature["geometry"]["coordinates"] == [(9.0, 0.0), (5.0, 0.0)]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from page_reading import unpacked
 
-from tcpipe.report.page import make_shown_column, pack_columns
+from tcpipe.report.page import pack_columns
 
 COUNT = 1000
 
@@ -33,8 +33,3 @@ def test_what_is_packed_is_read_back_as_well_as_the_kind_says(columns):
     np.testing.assert_allclose(values["std"], columns["std"][1], rtol=0.004)
     np.testing.assert_allclose(values["x"], columns["x"][1], rtol=0.0, atol=1000.0 / 65_534)
     assert pack_columns(columns) == told
-
-
-def test_steps_are_taken_only_where_they_hide_no_digit_that_is_shown():
-    assert make_shown_column(1, np.array([0.0, 3000.0]))[0] == "steps"
-    assert make_shown_column(1, np.array([0.0, 4000.0]))[0] == "f32"

@@ -91,10 +91,6 @@ def test_patches_are_those_of_the_samples_named(built, page):
     assert np.median(alike) < np.median(own)
 
 
-def picture(data):
-    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-
-
 def test_runs_lead_to_their_pages_in_the_store_beside(built, page):
     hrefs = [run["href"] for run in data_of(page)["runs"]]
     assert all((built / href).parent.is_dir() for href in hrefs)
@@ -121,14 +117,6 @@ def test_of_too_many_samples_the_first_are_shown(built, monkeypatch):
     data = data_of(render_dataset_report(built))
     assert max(data["patches"]["rows"]) < 30
     assert data["count"] == table.num_rows
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_few_samples_are_shown_as_well(built, count):
-    card, table = open_dataset(built).card, pq.read_table(built / "samples.parquet", columns=list(SAMPLE_COLUMNS))
-    shown = select_samples(card, table.slice(0, count))
-    assert shown.xy_m.shape == (count, 2)
-    assert len(unpacked(shown.json["packed"], "energy")) == count
 
 
 def test_a_damaged_dataset_says_so_on_its_page(built, tmp_path):

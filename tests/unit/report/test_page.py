@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 
 from tcpipe.formats.finding_lines import group_findings
 from tcpipe.report.page import Link, Number, PageSection, Shaded, render_page, show_verdict
-from tcpipe.report.plots import draw_waterfall, make_plot, render_plots
+from tcpipe.report.plots import draw_waterfall, make_plot
 from tcpipe.tables.findings import Remedy, Subject, judge, make_finding, read_catalogue
 
 EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e$$x$$ \\(y\\) \"'&"
@@ -141,12 +141,6 @@ def test_only_columns_of_numbers_are_aligned_to_the_right():
     assert right == ["13", "3.8 %", "+12 ms", "0.81 (0.70 to 0.95)", "0.061 s, 3.4 %", 7]
 
 
-def test_one_of_a_kind_is_called_so():
-    numbers = [Number("1", "runs"), Number("2", "datasets"), Number("1", "test")]
-    text = "".join(Seen(render_page(title="t", lead="", numbers=numbers, sections=[])).text)
-    assert "1run2datasets1test" in text
-
-
 def test_parts_without_figures_are_folded_and_long_texts_from_the_second_line():
     plot = make_plot("small", alt="small", axes=("x", "y"))
     plot.figure.line([0.0, 1.0], [0.0, 1.0])
@@ -162,44 +156,9 @@ def test_parts_without_figures_are_folded_and_long_texts_from_the_second_line():
     assert "cell" not in at_once
 
 
-def test_what_waits_joins_what_is_drawn_first_and_names_the_axis_that_it_shares():
-    def plot(name, **more):
-        made = make_plot(name, alt=name, axes=("x", "y"), **more)
-        made.figure.line([0.0, 1.0], [0.0, 1.0])
-        return made
-
-    asked = plot("asked")
-    every = [plot("beside", waits=True, x_range=asked.figure.x_range), asked, plot("alone", waits=True), plot("too")]
-    told, ids = render_plots(every)
-    first, later = told["first"]["roots"], told["later"]
-    assert [[root["attributes"]["name"] for root in of] for of in (first, later)] == [
-        ["asked", "too"],
-        ["beside", "alone"],
-    ]
-    placed = {root["attributes"]["name"]: root["id"] for root in first + later}
-    assert [placed[of.figure.name] for of in every] == ids
-    assert len(set(ids)) == 4
-    assert later[0]["attributes"]["x_range"] == {"id": first[0]["attributes"]["x_range"]["id"]}
-    assert render_plots([]) == (None, [])
-
-
-def test_the_same_page_is_the_same_bytes_whatever_was_drawn_before():
-    first = page()
-    draw_waterfall({"kept": 1.0})
-    assert page() == first
-
-
 def test_nothing_is_asked_of_the_network_and_bokeh_comes_with_figures_alone():
     html = page()
     assert "default-src 'none'" in html
     assert not [attrs for _, attrs in Seen(html).tags if {"src", "srcset", "data", "action"} & set(attrs)]
     html = render_page(title="t", lead="", numbers=[], warnings=[], sections=[PageSection("s", "text")])
     assert len(html) < 24_000
-
-
-def test_the_waterfall_ends_at_what_is_kept():
-    plot = draw_waterfall({"kept": 60.0, "stationary": 30.0, "gap": 10.0, "curved": 0.0})
-    data = next(iter(plot.figure.renderers)).data_source.data
-    assert data["name"] == ["driven", "stationary", "gap", "kept"]
-    assert list(zip(data["left"], data["right"], strict=True)) == [(0, 100), (70, 100), (60, 70), (0, 60)]
-    assert data["share"] == [100, 30, 10, 60]

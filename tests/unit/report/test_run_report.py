@@ -15,13 +15,11 @@ from tcpipe.report.run_plots import (
     find_finding_spans,
     find_mask_spans,
     make_rail_series,
-    make_speed_series,
     make_timeline,
     time_plots,
 )
 from tcpipe.report.run_report import run_report
 from tcpipe.store import open_store
-from tcpipe.tables.bits import Quality
 from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import POWER, REJECTIONS
 
@@ -96,24 +94,6 @@ def test_rails_that_tell_current_and_voltage_in_turn_are_series_of_their_own():
     assert found["voltage left"].columns["voltage"][1] == pytest.approx([25.0] * 3)
 
 
-def test_speed_of_a_sensor_that_tells_places_is_its_chord_over_a_second():
-    t_s = np.arange(0, 20, 0.1)
-    stamps = 10**18 + (t_s * 1e9).astype(np.int64)
-    table = pa.table(
-        {
-            "stamp_ns": stamps,
-            "clock_epoch": np.zeros(len(t_s), np.int16),
-            "x_m": 3.0 * np.cos(t_s / 3),
-            "y_m": 3.0 * np.sin(t_s / 3),
-        }
-    )
-    shown = make_speed_series("pose", table, make_timeline(driven(drive())))
-    assert shown.columns["speed"][1] == pytest.approx(
-        6.0 * np.sin(1 / 6), abs=1e-3
-    )  # chord of a circle of 3 m at 1 m/s
-    assert np.diff(shown.t_s) == pytest.approx(1.0)
-
-
 def test_a_run_without_power_map_or_sensors_says_so(tmp_path):
     table = drive(powered=False)
     html = page_of(tmp_path, table, track=driven(table, powered=False))
@@ -134,17 +114,6 @@ def test_a_run_without_track_or_segments_is_a_page_too(tmp_path):
     assert "No track: the log has no measurements that can be fused." in html
     assert "no segments from 12 m driven; largest loss: gap, 12 m" in html
     assert "<td>gap</td>" in html
-
-
-def test_a_bit_that_every_segment_carries_colours_none_of_them(tmp_path):
-    table = drive()
-    for number, (own, flags) in enumerate(((0, 0), (int(Quality.CURVED), int(Quality.CURVED)))):
-        bits = np.full(table.num_rows, int(Quality.NO_COMMAND))
-        bits[0] |= own
-        field = table.schema.field("quality")
-        flagged = table.set_column(table.column_names.index("quality"), field, pa.array(bits, field.type))
-        html = page_of(tmp_path / str(number), flagged, track=driven(table))
-        assert data_of(html)["flags"] == flags
 
 
 def test_a_step_of_the_clock_has_its_place_and_its_size():

@@ -220,14 +220,6 @@ def test_a_page_is_rendered_again_only_where_its_inputs_have_changed(tmp_path, m
     assert list_rendered() == ["a", "b"]
 
 
-def test_many_runs_are_all_told_and_some_can_be_read_without_scripts(store, monkeypatch):
-    monkeypatch.setattr("tcpipe.report.store_report.MOST_ROWS", 2)
-    _, html, _, rows = shown(store)
-    assert len(rows) == 5
-    assert "Without scripts the table shows the first 2 of 5." in html
-    assert html.split("<h2>All runs</h2>")[1].split("</section>")[0].count("<tr>") == 3
-
-
 def test_the_page_of_few_runs_begins_with_their_tracks_and_the_table(tmp_path, monkeypatch):
     store = open_world(tmp_path)
     for number, run_id in enumerate(("a", "b")):

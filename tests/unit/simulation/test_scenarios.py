@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario
-from tcpipe.simulation.scenarios import SCENARIOS, make_paper_world
+from tcpipe.simulation.scenarios import SCENARIOS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "simulation.md").read_text(encoding="utf-8")
 
@@ -31,15 +31,6 @@ def test_every_scenario_starts_on_free_ground_inside_its_site(name):
         assert made.world.terrain_class(x, y)[0] >= 4
         assert 0 < drive.start_m[0] < made.world.site.width_m
         assert 0 < drive.start_m[1] < made.world.site.height_m
-
-
-def test_the_papers_site_is_as_high_and_large_as_the_papers():
-    world = make_paper_world()
-    x = world.site.west_m + np.arange(0.5, 596.0)
-    y = world.site.south_m + np.arange(0.5, 305.0)
-    heights = world.height_m(x[None, :], y[:, None])
-    assert (heights.min(), heights.max()) == pytest.approx((574.8, 661.3), abs=1e-6)
-    assert heights.shape == (305, 596)
 
 
 def test_hills12_is_twelve_hilly_minutes(long_truth):

@@ -12,16 +12,12 @@ from tcpipe.simulation.world import (
     GRASS,
     MUD,
     PAVED,
-    UNPAVED,
     Band,
     Ellipse,
-    Hill,
     Site,
     SurfaceEffect,
     Wave,
     World,
-    draw_waves,
-    state,
 )
 
 SITE = Site()
@@ -39,24 +35,6 @@ def test_gradient_is_the_slope_of_the_height():
     gx, gy = world.gradient(x, y)
     np.testing.assert_allclose(gx, (world.height_m(x + step, y) - world.height_m(x - step, y)) / (2 * step), atol=2e-6)
     np.testing.assert_allclose(gy, (world.height_m(x, y + step) - world.height_m(x, y - step)) / (2 * step), atol=2e-6)
-
-
-def test_one_hill_by_hand():
-    world = World(SITE, 600.0, hills=(Hill(50.0, 30.0, 5.0, 8.0, 10.0),))
-    height = world.height_m(np.array(SITE.west_m + 58.0), np.array(SITE.south_m + 20.0))
-    assert height == pytest.approx(600.0 + 5.0 * np.exp(-1.0), abs=1e-9)
-
-
-def test_rows_and_columns_give_the_same_as_points():
-    world = make_paper_site().world
-    x, y = world.site.west_m + np.arange(0.5, 120.0, 7.0), world.site.south_m + np.arange(0.5, 80.0, 7.0)
-    flat_x, flat_y = (values.ravel() for values in np.meshgrid(x, y))
-    for function in (world.height_m, world.mapped_height_m, world.terrain_class, world.mapped, world.resistance_factor):
-        grid = function(x[None, :], y[:, None])
-        np.testing.assert_allclose(grid.ravel(), function(flat_x, flat_y), atol=1e-9)
-    np.testing.assert_allclose(
-        world.ortho(x[None, :], y[:, None]).reshape(-1, 3), world.ortho(flat_x, flat_y), atol=1e-9
-    )
 
 
 def test_classes_by_hand_and_later_regions_win():
@@ -92,66 +70,6 @@ def test_grid_north_and_scale_are_the_projections():
     assert scale[0] == pytest.approx(1.0 / factors.meridional_scale, abs=1e-8)
     higher, _ = SITE.ground_from_map(x, y, np.array([6371.0]))
     assert higher[0] / scale[0] == pytest.approx(1.001, abs=5e-6)
-
-
-def test_local_plane_is_metric_and_returns():
-    lon, lat = SITE.lonlat_deg(np.array([SITE.west_m, SITE.west_m + 100.0]), np.array([SITE.south_m, SITE.south_m]))
-    enu = SITE.enu_m(lon, lat, np.full(2, SITE.datum[2]))
-    scale, rotation = SITE.ground_from_map(
-        np.array([SITE.west_m + 50.0]), np.array([SITE.south_m]), np.full(1, SITE.datum[2])
-    )
-    along = enu[1] - enu[0]
-    assert np.hypot(along[0], along[1]) == pytest.approx(100.0 * scale[0], abs=1e-4)
-    assert np.arctan2(along[1], along[0]) == pytest.approx(rotation[0], abs=2e-5)
-    back = SITE.lonlatalt(enu)
-    np.testing.assert_allclose(back[0], lon, atol=1e-12)
-    np.testing.assert_allclose(back[2], SITE.datum[2], atol=1e-7)
-
-
-def test_a_state_is_spread_evenly_between_its_ends():
-    made = draw_waves(6, count=40, total=1.0, wavelength_m=(1.0, 5.0))
-    rng = np.random.default_rng(0)
-    values = state(made, rng.uniform(0, 2000, 20000), rng.uniform(0, 2000, 20000))
-    quantiles = np.quantile(values, [0.1, 0.25, 0.5, 0.75, 0.9])
-    assert quantiles == pytest.approx([-0.8, -0.5, 0.0, 0.5, 0.8], abs=0.06)
-
-
-RNG = np.random.default_rng(3)
-U, V = RNG.uniform(0, 500, 20000), RNG.uniform(0, 300, 20000)
-
-
-def on(class_id):
-    return np.full(U.size, class_id, np.uint8)
-
-
-def test_wet_ground_is_darker_and_resists_where_its_class_says_so():
-    surface = make_paper_surface()
-    wet = state(surface.wetness, U, V)
-    assert np.corrcoef(wet, surface.shade(on(MUD), U, V))[0, 1] < -0.8
-    assert np.corrcoef(wet, surface.resistance(on(MUD), U, V))[0, 1] > 0.99
-    assert abs(np.corrcoef(wet, surface.resistance(on(PAVED), U, V))[0, 1]) < 0.05  # dark, and costs nothing
-
-
-def test_resistance_keeps_within_its_sources_range():
-    """Carvill's gravel, 0.01 to 0.04, and wetness: never beyond their sum."""
-    found = make_paper_surface().resistance(on(UNPAVED), U, V)
-    assert np.abs(found).max() <= 0.7
-    assert found.std() == pytest.approx(np.hypot(0.6, 0.1) / np.sqrt(3.0), rel=0.1)
-
-
-def test_relief_is_as_rough_as_its_class():
-    surface = make_paper_surface()
-    swings = np.sqrt(1.0 + surface.swing**2 / 3.0)
-    wanted = np.hypot(surface.looks[GRASS].bump_m, surface.looks[GRASS].ridge_m) * swings
-    assert surface.relief_m(on(GRASS), U, V).std() == pytest.approx(wanted, rel=0.1)
-    assert surface.map_noise_m(U, V).std() == pytest.approx(surface.map_noise_std_m, rel=0.1)
-
-
-def test_the_pose_does_not_feel_what_the_raster_shows():
-    world = make_paper_site().world
-    x, y = world.site.west_m + U, world.site.south_m + V
-    more = world.mapped_height_m(x, y) - world.height_m(x, y)
-    assert 0.004 < more.std() < 0.03
 
 
 ROBOT = make_paper_site().robot
