@@ -75,23 +75,3 @@ def test_one_call_after_an_array_ingests_what_its_killed_tasks_left(root, drives
     assert ask_status(root, drives).counts == {"done": 7}
     assert verify(root).problems == ()
     assert len(open_store(root).runs()) == 6, "two of the logs are copies of one"
-
-
-def test_a_share_with_nothing_new_writes_its_record_alone(tmp_path, drives):
-    store = tmp_path / "store"
-    found = ingest([drives], store=store, recipe=Recipe(), shard=(1, 2))
-    done = [result for result in found.results if result.status == "done"]
-    assert {result.status for result in found.results} <= {"done", "unchanged"}
-    before = {entry.name for entry in open_store(store).place.entries()}
-    again = ingest([drives], store=store, recipe=Recipe(), shard=(1, 2))
-    assert {result.status for result in again.results} == {"unchanged"}
-    assert len(open_store(store).runs()) == len(done) > 0
-    new = {entry.name for entry in open_store(store).place.entries()} - before
-    assert [name.partition("/")[0] for name in new] == ["calls"] * 2
-
-
-def test_a_store_without_runs_stays_where_a_task_of_an_array_fails(tmp_path):
-    """Another task may be at it."""
-    (tmp_path / "junk.bag").write_bytes(b"junk")
-    ingest([tmp_path / "junk.bag"], store=tmp_path / "new", recipe=Recipe(), shard=(1, 1))
-    assert open_store(tmp_path / "new").scan().failed

@@ -209,15 +209,6 @@ def test_a_killed_call_may_be_acknowledged_and_the_next_one_is_told_again(root, 
     assert ask_status(root).exit_code == 3
 
 
-def test_a_call_that_was_done_by_another_says_by_which(root, logs, monkeypatch):
-    kill(logs, root, monkeypatch)
-    ingest([logs], store=root, recipe=Recipe())
-    killed, other = (call for _, call in reversed(open_store(root).scan().calls))
-    key = open_store(root).scan().calls[0][0]
-    assert (killed.exit_code, killed.message) == (1, f"its work was done by call-{key}")
-    assert other.exit_code == 0
-
-
 def test_a_killed_call_is_not_closed_by_one_under_another_recipe(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
     ingest([logs], store=root, recipe=Recipe(label=LabelConfig(velocity="fused")))
@@ -347,11 +338,3 @@ def test_status_without_logs_asks_each_folder_as_the_call_was_that_was_given_it(
     assert (found.counts, found.problems) == ({"done": 3}, ())
     assert ask_status(store, parts).counts == {"pending": 2}
     assert ask_status(store, logs).counts == {"outdated": 2}
-
-
-def test_options_that_are_not_given_are_read_as_they_were_written(root):
-    store = open_store(root, create=True)
-    with record_call(store, "ingest", ["/logs"], CallOptions(recipe="k")) as call:
-        call.begin()
-    ((_, found),) = open_store(root).scan().calls
-    assert CallOptions(**found.options) == CallOptions(recipe="k")

@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 from autopilot_files import Drive, write_ulog
 from mcap.writer import Writer
-from random_messages import ROS1, Message, random_messages, write_bag, write_mcap
+from random_messages import ROS1, Message, random_messages, write_mcap
 
 from tcpipe.errors import LogError, UsageError
 from tcpipe.pipeline.export import export
@@ -61,12 +61,6 @@ def test_nothing_is_written_between_files_that_are_counted(tmp_path, log, kind):
     assert [*out.rglob("*")] == before
 
 
-def test_commas_alone_name_no_topic(tmp_path, log):
-    with pytest.raises(LogError, match="no topic is named; there are: /BatteryState, /Imu, /Path"):
-        export(log, tmp_path / "out", topics=[", "])
-    assert [of.topic for of in export(log, tmp_path / "out", topics=["/Imu, ,/Imu,"]).topics] == ["/Imu"]
-
-
 def test_a_second_call_finds_everything_done(tmp_path, log):
     out = tmp_path / "out"
     first = export(log, out)
@@ -86,16 +80,6 @@ def test_topics_are_added_to_what_is_there(tmp_path, log):
     assert [of.topic for of in export(log, out, topics=["/Imu"]).topics] == ["/Imu"]
     assert [of.topic for of in export(log, out, topics=["/Path, /BatteryState"]).topics] == ["/Path", "/BatteryState"]
     assert export(log, out).status == "unchanged"
-
-
-@pytest.mark.parametrize(
-    "content", ["{}", '{"topics": []}', '{"topics": {"/Imu": {"file": "Imu.parquet"}, "/Path": 1}}']
-)
-def test_an_index_that_is_not_ours_counts_for_nothing(tmp_path, log, content):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "export.json").write_text(content)
-    assert export(log, tmp_path / "out").status == "done"
-    assert export(log, tmp_path / "out").status == "unchanged"
 
 
 def test_a_log_that_has_changed_is_exported_again(tmp_path, log):
@@ -156,13 +140,6 @@ def test_topics_of_which_none_can_be_read_are_an_error(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_damaged_log_without_topics_is_told_as_damaged(tmp_path):
-    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\xff" * 1000)
-    exported = export(tmp_path / "a.mcap", tmp_path / "out")
-    assert exported.topics == ()
-    assert len(exported.damage) == 2
-
-
 def test_names_that_make_one_file_name_get_files_of_their_own(tmp_path):
     messages = random_messages(5, count=5, types=("std_msgs/msg/ColorRGBA",))
     path = write_mcap(tmp_path / "a.mcap", renamed(messages, "/a/b", "a/b", "/A_b", "/" + 300 * "x", "/.x"))
@@ -181,13 +158,6 @@ def test_messages_without_fields_inside_arrays(tmp_path):
     (row,) = pq.read_table(of.path).to_pylist()
     nothing = {"structure_needs_at_least_one_member": None}
     assert (row["pair"], row["some"], row["x"]) == ([nothing] * 2, [nothing] * 3, 1.0)
-
-
-def test_a_bag_says_its_definitions_too(tmp_path):
-    messages = random_messages(7, count=5, types=("sensor_msgs/msg/Imu",), store=ROS1)
-    (of,) = export(write_bag(tmp_path / "a.bag", messages), tmp_path / "out").topics
-    about = described(of.path)
-    assert "geometry_msgs/Quaternion orientation" in about["definition"]
 
 
 def test_a_log_of_an_autopilot_is_exported_without_definitions(tmp_path):

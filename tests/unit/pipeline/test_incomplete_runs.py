@@ -8,11 +8,10 @@ import pytest
 from object_gateway import in_environment
 from storage_server import object_store
 from synthetic_store import add_run, add_world, lanes, make_fixes, open_world, segments, supersede, tag_run
-from wheel_drives import START_NS, ask_status, drive_at
+from wheel_drives import ask_status
 
 from tcpipe.formats import documents
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.verify import verify
@@ -136,32 +135,6 @@ def test_what_prune_removes_is_not_missed_and_what_a_person_removes_is(place, tm
     assert ask_status(root, tmp_path / "new.mcap").problems == ()
     lose(find_files(files, "a")["folder"])
     assert [of.subject.name for of in ask_status(root, tmp_path / "new.mcap").problems] == ["a"]
-
-
-@pytest.fixture(scope="module")
-def ingested(tmp_path_factory):
-    """Two logs and the store that they were ingested into, one of them tagged."""
-    here = tmp_path_factory.mktemp("ingested")
-    drive_at(here / "logs" / "one.mcap")
-    drive_at(here / "logs" / "two.mcap", seed=1, start_ns=START_NS + 10**13)
-    ingest([here / "logs"], store=here / "store", recipe=Recipe())
-    ingest([here / "logs" / "one.mcap"], store=here / "store", recipe=Recipe(), tag={"load": "12"})
-    return here
-
-
-@pytest.mark.parametrize("part", ["manifest", "folder", "segments"])
-def test_what_is_lost_is_made_again_from_the_log(ingested, tmp_path, part):
-    logs, root = ingested / "logs", shutil.copytree(ingested / "store", tmp_path / "store", copy_function=shutil.copy2)
-    one = next(run.run_id for run in Store(root).runs() if run.run_id.startswith("one"))
-    documents._DECODED.clear()
-    lose(find_files(root, one)[part])
-    assert ask_status(root).exit_code == (3 if part == "folder" else 0)
-    assert ingest([logs], store=root, recipe=Recipe(), force=part == "segments").exit_code == 0
-    found = ask_status(root)
-    assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})
-    prune(store=root, recipe=Recipe())
-    assert verify(root).problems == ()
-    assert [run.facts.tags for run in Store(root).find_runs(one)] == [{"load": "12"}]
 
 
 def test_a_map_whose_folder_is_gone_is_a_problem_until_it_is_added_again(tmp_path):

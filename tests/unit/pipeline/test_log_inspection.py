@@ -1,14 +1,10 @@
 """Everything read: gaps, stamps and clock steps that were put in come out."""
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
-from tcpipe.errors import UsageError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
-from tcpipe.pipeline import log_inspection
-from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.log_inspection import inspect_log
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import select_findings
@@ -72,24 +68,6 @@ def test_simulated_time_is_told_from_the_wall_clock(tmp_path):
     assert "simulated-time" in {of.code for of in found.findings}
 
 
-def test_counts_do_not_depend_on_the_pieces_that_a_log_is_read_in():
-    log_ns = START_NS + np.arange(10_000) * PERIOD_NS
-    log_ns[6000:] += 3_000_000_000
-    header_ns = log_ns.copy()
-    header_ns[7000:] += 9_000_000_000
-    table = pa.table(
-        {"log_time_ns": log_ns, "header.stamp.sec": header_ns // 10**9, "header.stamp.nanosec": header_ns % 10**9}
-    )
-    whole = log_inspection.TopicStamps()
-    whole.add(table)
-    pieces = log_inspection.TopicStamps()
-    for start in range(0, 10_000, 777):
-        pieces.add(table[start : start + 777])
-    assert pieces.counts() == whole.counts()
-    assert (whole.counts().gaps, whole.counts().longest_gap_s) == (1, 3.02)
-    assert pieces.topic_times().log_time_ns.tolist() == log_ns.tolist()
-
-
 def test_exact_duplicates_are_told_from_repeated_stamps(tmp_path):
     log_ns = np.repeat(START_NS + np.arange(1000) * PERIOD_NS, 2)
     header_ns = log_ns - 3_000_000
@@ -121,29 +99,6 @@ def test_a_recorder_that_stalls_is_no_gap_and_another_clock_is_told(tmp_path):
     assert topics["/c"].moved_s == (pytest.approx(60.0, abs=0.01),)
     assert topics["/b"].moved_s == ()
     assert found.clock_steps == ()
-
-
-def test_what_repeats_is_compared_in_every_kind_of_column():
-    rows = {
-        "log_time_ns": [1, 2, 3, 4, 5],
-        "publish_time_ns": [1, 2, 3, 4, 5],
-        "header.stamp.sec": [7] * 5,
-        "header.stamp.nanosec": [0] * 5,
-        "x": [float("nan")] * 5,
-        "texts": [["a"], ["a"], ["b"], ["b"], ["b"]],
-        "on": [True, True, True, False, False],
-    }
-    stamps = log_inspection.TopicStamps()
-    table = pa.table(rows)
-    for row in range(5):
-        stamps.add(table[row : row + 1])
-    assert (stamps.counts().duplicates, stamps.counts().repeated_stamps) == (2, 2)
-
-
-def test_a_link_that_leads_to_itself_is_refused(tmp_path):
-    (tmp_path / "loop").symlink_to("loop")
-    with pytest.raises(UsageError, match="there is no such file"):
-        inspect(tmp_path / "loop", recipe=Recipe())
 
 
 def battery_log(path, rate_hz):

@@ -16,7 +16,6 @@ from stored_files import map_path, read_files
 from tcpipe.cli import cli
 from tcpipe.errors import MapError, StoreError, UsageError
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.pipeline import maps
 from tcpipe.pipeline.maps import add_map
 from tcpipe.pipeline.verify import verify
 from tcpipe.store import Store
@@ -215,54 +214,6 @@ def test_a_quick_look_without_photo_is_a_relief_lit_from_the_north_west_and_smal
     assert picture[400, 50] == pytest.approx((0.5 + np.sqrt(0.5)) / np.sqrt(2.0), abs=0.01)
 
 
-def test_map_and_picture_are_replaced_together(site, store, tmp_path, monkeypatch):
-    """Killed between map and picture: the old ones are there, whole."""
-    add_map("m", store=store, **site)
-    old, other = picture_of(store).read_bytes(), other_height(tmp_path)
-    with monkeypatch.context() as killed:
-        killed.setattr(maps, "write_overview", lambda *_: pytest.fail("killed"))
-        with pytest.raises(pytest.fail.Exception):
-            add_map("m", store=store, height=other, force=True)
-    assert len(map_of(store).layers) == 3
-    assert picture_of(store).read_bytes() == old
-    assert verify(store).problems == ()
-    add_map("m", store=store, height=other, force=True)
-    assert list(map_of(store).layers) == ["height"]
-    assert picture_of(store).read_bytes() != old
-    assert verify(store).problems == ()
-
-
-@pytest.mark.parametrize("force", [False, True])
-def test_a_map_that_another_process_adds_meanwhile_stays(site, store, tmp_path, monkeypatch, force):
-    """The other one begins later and is done sooner."""
-    if force:
-        add_map("m", store=store, height=site["height"])
-    build, other = maps.build_map, other_height(tmp_path)
-
-    def slow(*args, **options):
-        monkeypatch.setattr(maps, "build_map", build)
-        add_map("m", store=store, height=other, force=force)
-        build(*args, **options)
-
-    monkeypatch.setattr(maps, "build_map", slow)
-    with pytest.raises(MapError, match=r"made from something else.*--force"):
-        add_map("m", store=store, **site, force=force)
-    assert map_of(store).facts.sources == {"height": "h2.tif"}
-    assert verify(store).problems == ()
-
-
-def test_the_same_map_added_twice_at_one_time_is_there_once(site, store, monkeypatch):
-    build = maps.build_map
-
-    def slow(*args, **options):
-        monkeypatch.setattr(maps, "build_map", build)
-        assert add_map("m", store=store, **site).status == "done"
-        build(*args, **options)
-
-    monkeypatch.setattr(maps, "build_map", slow)
-    assert add_map("m", store=store, **site).status == "unchanged"
-
-
 def halves(site, directory):
     """West and east half of the site's height, each in a folder of its own under one name, and the map that they make."""
     with rasterio.open(site["height"]) as dataset:
@@ -288,12 +239,6 @@ def test_tiles_come_as_patterns_and_each_is_known_by_its_content(site, store, tm
     assert "height has another content" in refused(store, "m", height=files[0])[0]
 
 
-def test_a_tile_that_a_pattern_names_once_more_lies_where_it_is_named_last(site, store, tmp_path):
-    halves(site, tmp_path)
-    add_map("m", store=store, height=[str(tmp_path / "*/dem.tif"), tmp_path / "east/dem.tif"])
-    assert list(map_of(store).facts.inputs.files["height"]) == ["west/dem.tif", "east/dem.tif"]
-
-
 def test_what_names_no_file_is_said(site, store, tmp_path):
     given = {"height": [tmp_path, "https://x.org/dem.tif", "/vsicurl/x.tif"], "ortho": str(tmp_path / "*.jpg")}
     assert refused(store, "m", UsageError, **given) == (
@@ -302,14 +247,3 @@ def test_what_names_no_file_is_said(site, store, tmp_path):
         "/vsicurl/x.tif: is an address, expected a file on this machine: rio convert /vsicurl/x.tif local.tif",
         f"{tmp_path}/*.jpg: no file matches",
     )
-
-
-def test_the_command_takes_patterns_and_repeated_options_and_knows_a_pattern_without_quotes(site, store, tmp_path):
-    halves(site, tmp_path)
-    east, west = (str(tmp_path / side / "dem.tif") for side in ("east", "west"))
-    whole = ["add-map", "m", "--store", str(store), "--quiet", "--height"]
-    assert CliRunner().invoke(cli, [*whole, str(tmp_path / "*/dem.tif")], catch_exceptions=False).exit_code == 0
-    again = CliRunner().invoke(cli, [*whole, east, "--height", west], catch_exceptions=False)
-    assert "nothing to do" in again.stdout
-    with pytest.raises(UsageError, match="quote patterns, as in"):
-        CliRunner().invoke(cli, [*whole, east, west], standalone_mode=False, catch_exceptions=False)

@@ -68,8 +68,3 @@ def test_what_exists_is_a_path_and_has_no_store(store, tmp_path):
     assert "a: is a path, and --store is where a run is looked up; give one of them" in str(found.exception)
     assert "b: from /logs/b.mcap" in CliRunner().invoke(cli, ["inspect", "b", "--store", "field"]).output
     assert "field: 2 runs, maps: none" in CliRunner().invoke(cli, ["inspect"], env={"TCPIPE_STORE": "field"}).output
-
-
-def test_the_page_of_a_run_lies_beside_its_tables(store):
-    pages = report("b", store="field")
-    assert [page.path for page in pages] == [run.folder.where("report.html") for run in store.find_runs("b")]

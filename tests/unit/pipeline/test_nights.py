@@ -222,42 +222,6 @@ def test_what_is_there_already_needs_no_worker_and_no_reader(tmp_path, night, mo
     assert [result.status for result in found.values()] == ["failed", "unchanged", "unchanged"]
 
 
-class _Killed(BaseException):
-    pass
-
-
-def test_after_a_kill_between_tables_and_manifest_the_log_is_ingested_by_the_next_call(tmp_path, night, monkeypatch):
-    def killed(*_):
-        raise _Killed
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Store, "put_run", killed)
-        with pytest.raises(_Killed):
-            night()
-    assert counted(tmp_path) == set()
-    assert ask_status(tmp_path / "store").counts == {"growing": 1}
-    assert night()[0]["other.mcap"].status == "done"
-    assert len(counted(tmp_path)) == 1
-    assert len(Store(tmp_path / "store").scan().blobs) == 2, "'tcpipe prune' removes the other"
-
-
-def test_after_a_kill_between_manifest_and_the_memory_of_the_log_nothing_is_fused_again(tmp_path, night, monkeypatch):
-    real = Store.put
-
-    def killed(self, state, kind, key, record, **how):
-        if kind == "seen":
-            raise _Killed
-        real(self, state, kind, key, record, **how)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Store, "put", killed)
-        with pytest.raises(_Killed):
-            night()
-    monkeypatch.setattr(ingestion, "run_stages", lambda *_, **__: pytest.fail("it is fused again"))
-    assert night()[0]["other.mcap"].status == "unchanged"
-    assert len(counted(tmp_path)) == 1
-
-
 def test_runs_of_two_recipes_live_side_by_side_and_share_their_streams(tmp_path, night, monkeypatch):
     night(tag={"soil": "dry"})
     other = Recipe(label=LabelConfig(velocity="fused"))

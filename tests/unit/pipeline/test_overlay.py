@@ -29,9 +29,3 @@ def test_a_step_of_the_clock_divides_two_delays():
 def test_simulated_time_that_runs_at_half_the_rate_is_stretched():
     simulated = clock([0.0, 10.0, 20.0], [5000.0, 5020.0, 5040.0], [0, 0, 0])
     assert asked(simulated, [0.0, 2.5, 15.0], [0, 0, 0]) == [5000.0, 5005.0, 5030.0]
-
-
-def test_nanoseconds_of_today_are_kept():
-    begin = 1_795_000_000_123_456_789
-    table = {"stamp_ns": [begin, begin + 1001], "log_time_ns": [begin + 7, begin + 1001 + 7], "clock_epoch": [0, 0]}
-    assert _Clock(pa.table(table))(np.array([begin + 500]), np.array([0]))[0] == begin + 507

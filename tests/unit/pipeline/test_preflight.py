@@ -1,9 +1,6 @@
 """Topics, rates and losses of preflight, by hand; tests/end_to_end compares its promise with an ingest."""
 
-import numpy as np
-import pytest
-
-from tcpipe.pipeline.preflight import ExpectedYield, RoleTopic, _compute_hourly_std, find_missing, find_slow
+from tcpipe.pipeline.preflight import ExpectedYield, RoleTopic, find_missing, find_slow
 from tcpipe.recipe import ReadConfig
 from tcpipe.tables.facts import EnergyBudget
 
@@ -40,11 +37,3 @@ def test_a_missing_role_is_no_note_before_it_is_too_late_to_record_one():
     assert severities == {
         "no-gnss": "error", "no-imu": "warning", "no-wheel-odometry": "warning", "no-power": "error", "no-command": "warning"
     }  # fmt: skip
-
-
-def test_the_deviation_of_a_count_is_that_of_its_windows():
-    # Windows of ten seconds that hold 10, 0, 10, 0, 10, 0: each deviates by 5.48, their sum by 13.4, and a minute is a sixtieth of an hour.
-    start_s = np.concatenate([np.arange(10) + begin for begin in (0, 20, 40)])
-    assert _compute_hourly_std((start_s * 1e9).astype(np.int64), 60.0) == pytest.approx(60 * np.sqrt(6) * np.sqrt(30))
-    assert _compute_hourly_std(np.zeros(0, np.int64), 60.0) == 0.0
-    assert _compute_hourly_std(np.zeros(3, np.int64), 29.0) is None

@@ -176,14 +176,6 @@ def test_files_of_others_stay(store):
     assert not gone.exists()
 
 
-@pytest.fixture
-def elsewhere(monkeypatch):
-    """Make all calls those of a process on another machine."""
-    with monkeypatch.context() as patch:
-        patch.setattr(calls, "identify_process", lambda: replace(identify_process(), host="node7"))
-        yield
-
-
 def test_nothing_goes_while_a_call_runs_or_may_run(store, monkeypatch):
     before = list_tables(store)
     for how in ({}, {"host": "node7"}):
@@ -201,35 +193,6 @@ def test_nothing_goes_while_a_call_runs_or_may_run(store, monkeypatch):
         assert found.waits_for in str(prune(store=store.root, recipe=Recipe(), dry_run=True))
         running.__exit__(None, None, None)
     assert len(prune(store=store.root, recipe=Recipe()).removed) == 3
-
-
-def test_a_call_that_begins_while_prune_works_keeps_everything(store, monkeypatch):
-    """Runs that were given up count again."""
-    before, listed = list_tables(store), prune.__globals__["list_payload"]
-    running = record_call(store, INGEST, ["/logs"])
-
-    def list_late(place):
-        running.__enter__()
-        return listed(place)
-
-    monkeypatch.setitem(prune.__globals__, "list_payload", list_late)
-    found = prune(store=store.root, recipe=Recipe())
-    assert found.waits_for is not None
-    assert (found.removed, list_tables(store)) == ((), before)
-
-
-def test_what_a_dataset_that_is_built_meanwhile_refers_to_stays(store, monkeypatch):
-    listed, old = prune.__globals__["list_payload"], name(store, "a")
-
-    def build(place):
-        put_output(store, "/nowhere", old)
-        return listed(place)
-
-    monkeypatch.setitem(prune.__globals__, "list_payload", build)
-    found = prune(store=store.root, recipe=Recipe())
-    assert [each.name for each in found.kept] == [old]
-    assert old in list_tables(store)
-    assert verify(store.root).problems == ()
 
 
 def test_the_payload_of_a_killed_call_goes_at_once(store, monkeypatch):

@@ -13,8 +13,7 @@ from tcpipe.formats.stored_runs import read_streams
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.report import report
-from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
+from tcpipe.recipe import LabelConfig, Recipe
 from tcpipe.store import Store
 from tcpipe.tables.findings import is_problem
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
@@ -77,12 +76,6 @@ def test_a_manifest_that_has_changed_is_no_document(store):
     found = inspect(store.root, recipe=Recipe())
     assert ([run.run_id for run in found.runs], len(found.damaged)) == (["a", "c", "d"], 1)
     assert problems(build(store)) == [("run-gone", "b")]
-
-
-def test_a_damaged_table_stops_the_page_of_its_run(store):
-    flip(table(store.find_runs("b")[0], "track"))
-    with pytest.raises(StoreError, match="its sha256"):
-        report("b", store=store.root)
 
 
 def remove(store, run_id):
@@ -161,11 +154,6 @@ def test_a_split_that_is_empty_is_told_and_fails_the_first_time(store, tmp_path,
         result = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), holdout=holdout, split=region)
         assert problems(result) == [("split-empty", empty)]
         assert result.exit_code == exit_code
-
-
-def test_no_test_is_no_problem_where_none_is_wanted(store, tmp_path):
-    recipe = Recipe(split=SplitConfig(test_fraction=0.0))
-    assert build_dataset(tmp_path / "out", store=store.root, recipe=recipe).exit_code == 0
 
 
 def test_streams_that_are_not_as_they_were_written_are_made_again(store):

@@ -1,17 +1,13 @@
 """A dataset from several maps: every sample lies on exactly one of them, and shows the ground that is there."""
 
-import json
-
 import numpy as np
 import pyproj
 import pytest
-from click.testing import CliRunner
 from map_worlds import write_tif
 from rasterio import Affine
 from stored_files import map_path
 from synthetic_store import WORLD, add_run, lanes, segments
 
-from tcpipe.cli import cli
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, MapError
 from tcpipe.formats.dataset_files import read_card, read_samples
@@ -20,7 +16,6 @@ from tcpipe.formats.maps.map_files import open_map
 from tcpipe.pipeline.dataset import sampling as dataset_sampling
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.report.pictures import compute_joint_bounds_m, draw_maps
 from tcpipe.store import open_store
 
@@ -91,15 +86,6 @@ def test_every_sample_lies_on_the_first_map_that_has_it_and_shows_the_world(stor
     assert min(counts.values()) > 60
 
 
-def test_the_card_names_the_maps_in_their_order_and_a_second_call_does_nothing(store, tmp_path):
-    build(store, tmp_path / "out", ["east", "west"])
-    card = read_card(tmp_path / "out")
-    assert [entry.name for entry in card.maps] == ["east", "west"]
-    assert [entry.crs for entry in card.maps] == ["EPSG:31256", "EPSG:32633"]
-    assert build(store, tmp_path / "out", ["east", "west"]).status == "unchanged"
-    assert build(store, tmp_path / "out", ["west", "east"], force=True).status == "done"
-
-
 @pytest.mark.parametrize("order", [("west", "east"), ("east", "west")])
 def test_the_page_shows_all_maps_in_their_places(store, order):
     """Grey of the world at places of either map alone, in the CRS of the first; white outside both."""
@@ -154,11 +140,3 @@ def test_maps_are_held_open_only_while_samples_are_taken(store, tmp_path, monkey
         build(store, tmp_path / "other", ("west", "east"))
     assert seen == [1]
     assert not dataset_sampling._held
-
-
-def test_the_option_may_be_repeated(store, tmp_path, monkeypatch):
-    monkeypatch.setattr("tcpipe.pipeline.dataset.writing.render_dataset_report", render_dataset_report)
-    arguments = ["build-dataset", str(tmp_path / "out"), "--store", str(store.root), "--map", "west", "--map", "east"]
-    result = CliRunner().invoke(cli, [*arguments, "--quiet", "--json"], catch_exceptions=False)
-    assert result.exit_code == 0
-    assert json.loads(result.stdout)["card"]["samples"] > 180

@@ -244,17 +244,6 @@ def test_a_store_that_is_not_there_is_named_as_it_was_given(tmp_path, monkeypatc
     assert str(told.exception) == "nosuch: no store here and none at tcpipe-store; name one with --store"
 
 
-def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_path):
-    causes = {group.cause for group in where(first_night, force=True).groups}
-    assert "to be ingested again if present" in causes
-    told = CliRunner().invoke(
-        cli, ["ingest", str(first_night / "logs"), "--store", str(tmp_path / "none"), "--dry-run"]
-    )
-    assert told.exit_code == 0, told.output
-    assert "4 pending" in told.output
-    assert not (tmp_path / "none").exists()
-
-
 def test_a_drive_without_a_segment_is_news_once_and_can_be_accepted(tmp_path):
     drive_at(tmp_path / "logs" / "drive.mcap")
 

@@ -1,7 +1,5 @@
 """The longest run counts of those of one robot that begin with the same measurements: each scan finds it."""
 
-import shutil
-
 import numpy as np
 import pytest
 from synthetic_store import add_run, lanes, segments
@@ -95,35 +93,12 @@ def test_another_robot_other_values_another_begin_or_another_recipe_supersede_no
     assert counted(store) == ["one", "two"]
 
 
-def test_under_each_recipe_the_longest_counts(store):
-    for recipe in (Recipe(), OTHER):
-        put(store, "short", 5, recipe=recipe)
-    put(store, "long", 9, recipe=OTHER)
-    assert [(run.run_id, run.recipe_id) for run in store.runs()] == sorted(
-        (row.run_id, row.recipe_id) for row in store.scan().list_rows() if not row.superseded_by
-    )
-    assert sorted(counted(store)) == ["long", "short"]
-    assert [row.superseded_by for row in store.scan().list_rows("short")].count("long") == 1
-
-
 def test_of_two_that_are_as_long_the_one_without_damage_counts(store):
     put(store, "damaged", 9, damage=DAMAGE, findings=DAMAGE)
     put(store, "repaired", 9)
     assert superseded(store) == {"damaged": "repaired"}
     put(store, "damaged, longer", 10, damage=DAMAGE, findings=DAMAGE)
     assert counted(store) == ["damaged, longer"]
-
-
-def test_runs_of_one_content_do_not_supersede_each_other(store):
-    put(store, "one", 9, sha256="f" * 64)
-    put(store, "one", 9, sha256="f" * 64, recipe=OTHER)
-    assert superseded(store) == {}
-
-
-def test_runs_without_measurements_do_not_supersede_each_other(store):
-    for name in ("a", "b"):
-        add_run(store, name, segments(name, *lanes(0.0, 0.0, 5.0)))
-    assert superseded(store) == {}
 
 
 # --- of logs --------------------------------------------------------------------------------------------------------
@@ -154,14 +129,6 @@ def test_a_name_used_again_for_another_drive_supersedes_nothing(tmp_path, later)
     assert counted(Store(store)) == sorted(before + run_ids(summary))
 
 
-def test_a_log_that_lost_its_end_takes_the_place_of_nothing(tmp_path):
-    log, store = drive_at(tmp_path / "latest.mcap"), tmp_path / "store"
-    before = run_ids(ingest([log], store=store, recipe=Recipe()))
-    drive_at(log, rows=700)
-    ingest([log], store=store, recipe=Recipe())
-    assert counted(Store(store)) == before
-
-
 @pytest.mark.parametrize("rest_s", [0.0, 3.0])
 def test_drives_in_tables_whose_time_starts_at_0_do_not_supersede_each_other(tmp_path, rest_s):
     """Also where each robot rests at first, so that its odometer gives the same values in each drive."""
@@ -176,12 +143,3 @@ def test_drives_in_tables_whose_time_starts_at_0_do_not_supersede_each_other(tmp
     summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=recipe)
     assert [result.status for result in summary.results] == ["done", "done"], summary.results
     assert superseded(Store(tmp_path / "store")) == {}
-
-
-def test_a_copy_of_a_log_under_another_name_is_the_same_run(tmp_path):
-    log, store = drive_at(tmp_path / "a.mcap"), tmp_path / "store"
-    ingest([log], store=store, recipe=Recipe())
-    shutil.copy(log, tmp_path / "b.mcap")
-    (result,) = ingest([tmp_path / "b.mcap"], store=store, recipe=Recipe()).results
-    assert (result.status, result.same_as) == ("unchanged", str(log))
-    assert len(counted(Store(store))) == 1

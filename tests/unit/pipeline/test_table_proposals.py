@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 from table_loggers import Drive, write_spanish
 
-from tcpipe.errors import LogError, UsageError
+from tcpipe.errors import UsageError
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.logs.table_folders import find_table_logs
 from tcpipe.formats.recipe_toml import parse_recipe, parse_toml
@@ -79,13 +79,6 @@ def test_numbered_files_are_runs_and_both_sides_are_one_robot(tmp_path):
     assert text.count("\n# columns.angular_z") == text.count("\n# nominal_voltage_volt") == 1
 
 
-def test_numbers_of_motors_are_no_runs(tmp_path):
-    write(tmp_path / "gps.csv", time=SECONDS + UTC_S, **FIXES)
-    for motor in (1, 2):
-        write(tmp_path / f"motor_{motor}.csv", time=SECONDS + UTC_S, voltage=24.0 + SECONDS, current=1.0 + SECONDS)
-    assert "*" not in propose_recipe(tmp_path).toml()
-
-
 @pytest.mark.parametrize(
     ("latitude", "expected"), [(4704.1, "is no"), (0.82, "radians"), (470_612_345.0, ""), (47.06, "")]
 )
@@ -108,25 +101,6 @@ def test_latitudes_that_are_no_degrees_are_for_a_person(tmp_path, latitude, expe
 def test_a_speed_and_a_place_beside_fixes_are_computed_from_them(tmp_path):
     write(tmp_path / "gps.csv", time=SECONDS + UTC_S, **FIXES, speed=0.5, x=SECONDS, y=SECONDS)
     assert set(proposed(tmp_path)[0]["tables"]) == {"gnss"}
-
-
-def test_what_cannot_be_power_is_not_proposed(tmp_path):
-    write(
-        tmp_path / "log.csv",
-        time=SECONDS + UTC_S,
-        v=0.5 + 0 * SECONDS,
-        battery_voltage=0.0,
-        battery_current=0.0,
-        energy_per_m=3.0,
-    )
-    assert set(proposed(tmp_path)[0]["tables"]) == {"wheel_odometry"}
-
-
-def test_commands_and_velocities_of_one_table_are_told_apart(tmp_path):
-    write(tmp_path / "log.csv", time=SECONDS + UTC_S, cmd_vel_x=1.0, odom_vel_x=0.9)
-    tables = proposed(tmp_path)[0]["tables"]
-    assert tables["command"]["columns"] == {"linear_x": "cmd_vel_x"}
-    assert tables["wheel_odometry"]["columns"] == {"linear_x": "odom_vel_x"}
 
 
 def test_a_folder_without_known_names_says_so(tmp_path):
@@ -184,41 +158,6 @@ def test_speeds_of_both_sides_in_other_units_words_and_a_counter_are_read_in_si(
     assert odometry["twist.twist.angular.z"].to_numpy() == pytest.approx(1.0 / 0.5)  # of the track width of the comment
 
 
-def test_tables_of_one_column_each_are_told_by_the_names_of_their_files(tmp_path):
-    write(tmp_path / "battery_voltage.csv", time=UTC_S + SECONDS, data=24.0 + SECONDS)
-    write(tmp_path / "battery_current.csv", time=UTC_S + SECONDS, data=3.0 + SECONDS)
-    write(tmp_path / "battery_temperature.csv", time=UTC_S + SECONDS, data=30.0)
-    values, recipe, text = proposed(tmp_path)
-    assert {name: of["columns"] for name, of in values["tables"].items()} == {
-        "battery_voltage": {"voltage": "data"},
-        "battery_current": {"current": "data"},
-    }
-    assert "nominal_voltage_volt" not in text, "there is a voltage"
-    topics = open_single_log(tmp_path, tables=recipe.tables).topics
-    assert set(topics) == {"/battery_voltage", "/battery_current"}
-    (tmp_path / "battery_voltage.csv").unlink()
-    assert "# nominal_voltage_volt = 24.0" in proposed(tmp_path)[2]
-
-
-def test_an_expression_of_columns_in_another_unit_needs_its_own(tmp_path):
-    write(tmp_path / "wheels.csv", time=UTC_S + SECONDS, **{"velL__(km/h)": 3.6, "velR__(km/h)": 3.6})
-    table = {"file": "wheels.csv", "columns": {"linear_x": "(`velL (km/h)` + `velR (km/h)`) / 2"}}
-    for units, problem in (({}, "state the unit"), ({"linear_x": "km/h"}, None)):
-        recipe = parse_recipe({"tables": {"wheel_odometry": {**table, "units": units}}}, where="test")
-        if problem is None:
-            open_single_log(tmp_path, message_definitions=None, tables=recipe.tables)
-        else:
-            with pytest.raises(LogError, match=problem):
-                open_single_log(tmp_path, message_definitions=None, tables=recipe.tables)
-
-
-def test_of_several_columns_of_one_name_a_person_decides(tmp_path):
-    (tmp_path / "power.csv").write_text(
-        "time,voltage,current,current\n" + "".join(f"{UTC_S + k},24,{k},{k}\n" for k in range(30))
-    )
-    assert "# [tables.power]" in propose_recipe(tmp_path).toml()
-
-
 def test_one_table_of_odd_names_is_fixes_wheels_and_power(tmp_path):
     table = {"Timestamp_us": WALL_NS // 1000, "GPS__Lat": 26.37 + 1e-6 * np.arange(ROWS), "GPS__Lng": -80.1}
     table |= {"Alt__MSL__(ft)": 10.0, "Fix__Quality": 4, "spd_L__(km/h)": 1.8, "spd_R__(km/h)": 1.9, "SoC__%": 80}
@@ -249,19 +188,6 @@ def test_what_is_not_recognised_is_named_under_its_role_with_three_values(tmp_pa
         assert word in imu
     assert '# columns.linear_acceleration_x = "ax[g]"' in text
     assert '# columns.angular_velocity_x = "column?"' in text
-
-
-def test_a_gyroscope_is_no_wheel(tmp_path):
-    write(tmp_path / "gps.csv", time=SECONDS + UTC_S, **FIXES)
-    axes = {f"angular_velocity_{axis}": 0.01 + SECONDS for axis in "xyz"}
-    write(
-        tmp_path / "imu.csv",
-        time=SECONDS + UTC_S,
-        **axes,
-        **dict(zip(("ax", "ay", "az"), (0.1, 0.2, 9.8), strict=True)),
-    )
-    write(tmp_path / "gyro.csv", time=SECONDS + UTC_S, **axes)
-    assert set(proposed(tmp_path)[0]["tables"]) == {"gnss", "imu"}
 
 
 @pytest.mark.parametrize(

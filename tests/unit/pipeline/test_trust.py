@@ -6,7 +6,6 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from made_tracks import with_columns
@@ -22,7 +21,7 @@ from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.runs import Output
 from tcpipe.pipeline.calls import record_call
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.diff import _match_by_time, diff
+from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
@@ -129,20 +128,6 @@ def test_files_that_went_or_came_are_found(copy):
     ]
 
 
-def test_damage_of_a_map_is_found_and_hides_nothing_else(copy):
-    root = copy("store")
-    store = Store(root)
-    layers = store.map_at(store.find_map("site"))[0]
-    flip(files(layers / "height" / "c")[0])
-    shutil.rmtree(layers / "ortho" / "c")
-    shutil.rmtree(store.find_runs("north")[0].folder.path)
-    assert any("height/c/0/0: its sha256" in problem for problem in verify(layers).problems)
-    assert any("ortho/c/0/0: is missing" in problem for problem in verify(layers).problems)
-    problems = verify(root).problems
-    for words in ("height/c/0/0: its sha256", "ortho/c/0/0: is missing", "is missing (run north)"):
-        assert any(words in problem for problem in problems), words
-
-
 def test_a_manifest_that_counts_otherwise_is_found(copy):
     store = Store(copy("store"))
     (run,) = store.find_runs("south")
@@ -150,18 +135,6 @@ def test_a_manifest_that_counts_otherwise_is_found(copy):
     store.put_run(store.scan(), replace(made, counts=replace(made.counts, segments=made.counts.segments + 1)))
     (problem,) = verify(store.root).problems
     assert problem.endswith("segments is 225, but segments.parquet has 224 rows")
-
-
-def test_a_damaged_document_of_any_kind_is_named_with_its_repair(copy):
-    store = Store(copy("store"))
-    dress(store)
-    for path in store.root.glob("*/*.json"):
-        whole = path.read_bytes()
-        flip(path)
-        found = verify(store.root)
-        assert any(line.startswith(f"{path}: ") for line in found.problems), path
-        assert any(note.startswith(f"{path}: copy it again, or remove it") for note in found.notes), path
-        path.write_bytes(whole)
 
 
 def test_strange_files_in_a_store_are_named_and_what_a_killed_command_left_behind(copy):
@@ -196,19 +169,6 @@ def test_what_is_none_of_these_is_said(tmp_path):
     for path in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(UsageError, match=r"give|name its store"):
             verify(path)
-
-
-@pytest.mark.parametrize("name", ["zarr", "parquet"])
-def test_a_sample_is_explained(made, name):
-    for part in ("train", "unseen"):
-        samples = open_dataset(made / name)[part].samples
-        for row in (0, len(samples) // 2):
-            sample_id = samples["sample_id"][row].as_py()
-            found = explain(sample_id, dataset=made / name, store=made / "store")
-            text = str(found)
-            assert f"split {part}" in text
-            assert f"/logs/{samples['run_id'][row].as_py()}.mcap" in text
-            assert "\nmap      site in EPSG:32633 from height " in text
 
 
 def find_sample(made, run_id):
@@ -288,39 +248,6 @@ def test_causes_and_effects_are_named(made, copy, tmp_path):
     assert not found.same
     lines = str(found)
     assert "28 only in b" in lines
-
-
-def test_the_shift_of_labels_is_over_all_samples(made, copy, tmp_path):
-    store = Store(copy("store"))
-    add_run(store, "later", segments("later", *lanes((18.0,), -14.0, 14.0), start_ns=int(2e18)))
-    build_dataset(tmp_path / "b", store=store.root, recipe=Recipe())
-    found = diff(made / "zarr", tmp_path / "b")
-    for path, name in ((made / "zarr", "a"), (tmp_path / "b", "b")):
-        values = np.concatenate([part.samples["velocity_mps"].to_numpy() for part in open_dataset(path).values()])
-        assert found.labels["velocity_mps"][f"mean_{name}"] == pytest.approx(values.mean())
-        assert found.labels["velocity_mps"][f"std_{name}"] == pytest.approx(values.std())
-    lines = [line for line in str(found).splitlines() if " of all samples: mean " in line]
-    assert [line.partition(" ")[0] for line in lines] == ["velocity_mps"], "nothing else differs but by rounding"
-
-
-@pytest.mark.parametrize("counts", [(0, 3), (3, 0), (40, 50)])
-def test_samples_are_matched_by_run_and_time(counts):
-    draw = np.random.default_rng(0)
-
-    def table(count):
-        begin = np.sort(draw.choice(60, count, replace=False)) * 10 + draw.integers(0, 3, count)
-        run_ids = pa.array(draw.choice(["x", "y", "z"], count).tolist(), pa.string())
-        return pa.table({"run_id": run_ids, "start_ns": begin, "end_ns": begin + 10})
-
-    a, b = table(counts[0]), table(counts[1])
-    wanted = {
-        (i, j)
-        for i, ours in enumerate(a.to_pylist())
-        for j, theirs in enumerate(b.to_pylist())
-        if ours["run_id"] == theirs["run_id"] and abs(ours["start_ns"] - theirs["start_ns"]) <= 1
-    }
-    assert set(zip(*map(np.ndarray.tolist, _match_by_time(a, b)), strict=True)) == wanted
-    assert wanted or not all(counts)
 
 
 def test_the_changes_of_labels_are_those_of_the_samples_in_both(made, copy):

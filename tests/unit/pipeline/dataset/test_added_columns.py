@@ -12,7 +12,7 @@ from tcpipe.formats.dataset_files import read_card, read_samples
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.content import find_narrow_patches
 from tcpipe.pipeline.verify import verify
-from tcpipe.recipe import CovariateConfig, Recipe, SampleConfig, SplitConfig
+from tcpipe.recipe import CovariateConfig, Recipe, SplitConfig
 from tcpipe.robots import Robot
 from tcpipe.store import Store
 from tcpipe.tables.findings import Subject, select_findings
@@ -84,16 +84,6 @@ def test_samples_that_no_row_reaches_are_null_counted_and_said(store, tmp_path):
     assert read_samples(tmp_path / "out")["weather_temp_c"].null_count == 0
 
 
-def test_another_table_of_the_same_name_makes_another_dataset(store, tmp_path):
-    path = weather(tmp_path / "weather.csv")
-    assert build(store, tmp_path / "out", covariates=path).status == "done"
-    assert build(store, tmp_path / "out", covariates=path).status == "unchanged"
-    path.write_text(path.read_text().replace("dry", "wet"))
-    assert build(store, tmp_path / "out", covariates=path).status == "done"
-    assert build(store, tmp_path / "out", force=True).status == "done"
-    assert "weather_temp_c" not in read_samples(tmp_path / "out").column_names
-
-
 def test_columns_of_one_name_are_refused(store, tmp_path):
     path = weather(tmp_path / "tag.csv")
     path.write_text(path.read_text().replace("ground", "season"))
@@ -150,23 +140,3 @@ def test_a_robot_wider_than_a_patch_or_of_unknown_width_is_named(store, tmp_path
     assert found[2].numbers == {"width_m": 1.38, "patch_m": 1.0}
     assert found[2].remedies[0].recipe == {"sample": {"patch_m": 1.38}}
     assert find_narrow_patches(["warthog"], known, patch_m=1.5) == []
-
-
-def test_wider_patches_lie_around_the_same_metre(store, tmp_path):
-    build(store, tmp_path / "usual")
-    build(store, tmp_path / "wide", recipe=Recipe(sample=SampleConfig(patch_m=1.5, patch_px=60)))
-    usual, wide = (open_dataset(tmp_path / name) for name in ("usual", "wide"))
-    shared = {row["sample_id"]: row for row in read_samples(tmp_path / "usual").to_pylist()}
-    rows = read_samples(tmp_path / "wide").to_pylist()
-    assert all(row["chord_m"] == shared[row["sample_id"]]["chord_m"] for row in rows)
-    by_id = {}
-    for dataset in (usual, wide):
-        for name in ("train", "test"):
-            split = dataset[name]
-            heights = (
-                split.layers(np.arange(len(split)))["height"] * 0.0005 + split.column("height_min_m")[:, None, None]
-            )
-            for key, height in zip(split.column("sample_id"), heights, strict=True):
-                by_id.setdefault(key, []).append(height)
-    for narrow, around in by_id.values():  # 25 mm a pixel both: the middle 40 of 60 are the same ground
-        np.testing.assert_allclose(around[10:50, 10:50], narrow, atol=0.0011)

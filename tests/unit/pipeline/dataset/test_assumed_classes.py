@@ -63,18 +63,6 @@ def test_numbers_without_a_table_are_named_until_a_table_is_given(tmp_path, stor
     assert set(built.card.terrain["train"]) <= {"gravel", "edge", "lawn"}
 
 
-def test_a_second_map_does_not_make_an_assumption_true(tmp_path, store):
-    paths = write_rasters(tmp_path)
-    for name in ("one", "two"):
-        added = add_map(name, store=store.root, **paths)
-        assert select_findings(added.map.findings, "classes-assumed")
-    (tmp_path / "classes.csv").write_text(
-        "value,id,name,traversable\n4,1,lawn,yes\n5,2,bog,yes\n6,3,a,yes\n7,4,b,yes\n"
-    )
-    for name in ("one", "two"):
-        add_map(name, store=store.root, **paths, classes=tmp_path / "classes.csv", force=True)
-
-
 def test_ground_that_was_driven_but_is_not_traversable_is_said_with_its_value(tmp_path, store):
     """The site's grass, driven for the most part, has the value 2, which the paper calls a tree."""
     add_map("site", store=store.root, **write_rasters(tmp_path, {4: 2, 5: 5, 6: 6, 7: 7}))

@@ -147,16 +147,6 @@ def test_a_drive_in_two_logs_counts_once(store, tmp_path):
     assert [run.run_id for run in result.card.runs] == ["a"]
 
 
-def test_a_new_run_that_is_a_duplicate_is_told_by_the_call_that_finds_it(store, tmp_path):
-    add(store, start_ns=10**18, fixes={})
-    build(store, tmp_path)
-    add(store, "b", start_ns=10**18 + 300_000_000, fixes={"late_ns": 300_000_000})
-    result = build(store, tmp_path)
-    assert (result.status, twice(result)) == ("done", [("b", "a", 20, 20)])
-    again = build(store, tmp_path)
-    assert (again.status, twice(again), again.exit_code) == ("unchanged", twice(result), 0)
-
-
 @pytest.mark.parametrize(("names", "skew_ns"), [(("a", "b"), 0), (("b", "a"), 300_000_000), (("a", "b"), -900_000_000)])
 def test_a_recording_that_overlaps_another_counts_once_where_it_does(store, tmp_path, names, skew_ns):
     """One drive of 40 m; its second recording has the last 20 m of the first one and 10 m more."""
@@ -180,13 +170,6 @@ def test_a_drive_that_was_recorded_in_two_pieces_is_one_and_a_short_one_after_it
     result = build(store, tmp_path)
     assert result.card.samples == 22
     assert twice(result) == []
-
-
-def test_two_robots_at_one_time_and_one_robot_at_two_times_are_two_drives(store, tmp_path):
-    add(store, start_ns=10**18)
-    add(store, "b", (5.0,), start_ns=10**18)  # elsewhere
-    add(store, "c", start_ns=2 * 10**18)  # the same place, later
-    assert build(store, tmp_path).card.samples == 60
 
 
 OTHER_TOPIC = {"drive": 1, "topic": "/gps/fix"}
@@ -279,14 +262,6 @@ def test_a_map_is_verified_when_something_is_built(store, tmp_path):
     assert "map site: changed since it was written" in refused(store, tmp_path, MapError)
 
 
-def test_metres_off_the_map_are_in_the_ledger(store, tmp_path):
-    add(store, x=(9.5, 29.5))
-    result = build(store, tmp_path)
-    assert result.card.samples == 10
-    assert result.card.distance_by_reason_m["outside_map"] == pytest.approx(10)
-    assert result.card.distance_by_reason_m["kept"] == pytest.approx(10)
-
-
 SWAPPED = {"type": "Polygon", "coordinates": [lonlat([*box(-20, -20, 20, 20), (-20, -20)])[:, ::-1].tolist()]}
 EVERYTHING = box(-20, -20, 20, 20)
 
@@ -322,35 +297,12 @@ def test_an_exclude_region_takes_samples_out_of_the_dataset(store, tmp_path):
     assert result.card.samples == 10
 
 
-@pytest.mark.parametrize("kind", ["file", "directory"])
-def test_what_is_no_dataset_is_left_alone(store, tmp_path, kind):
-    add(store)
-    out = tmp_path / "out"
-    if kind == "file":
-        out.write_text("precious")
-    else:
-        out.mkdir()
-        (out / "notes.txt").write_text("precious")
-    line = refused(store, tmp_path, UsageError, holdout="sample")
-    assert "give another OUT" in line
-    assert (out if kind == "file" else out / "notes.txt").read_text() == "precious"
-
-
 def test_a_dataset_that_lost_a_file_is_built_again(store, tmp_path):
     add(store)
     build(store, tmp_path)
     (tmp_path / "out" / "samples.parquet").unlink()
     assert build(store, tmp_path).status == "done"
     assert (tmp_path / "out" / "samples.parquet").exists()
-
-
-def test_holdout_and_seed_overrule_the_recipe(store, tmp_path):
-    add(store)
-    sample = build(store, tmp_path, holdout="sample")
-    assert (sample.card.splits["train"], sample.card.splits["test"]) == (16, 4)
-    first = set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist())
-    build(store, tmp_path, holdout="sample", seed=1, force=True)
-    assert set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist()) != first
 
 
 def test_one_run_cannot_be_held_out_and_it_is_said(store, tmp_path):
@@ -370,23 +322,6 @@ def test_what_the_call_says_instead_of_the_recipe_is_checked_as_the_recipe_is(st
         build(store, tmp_path, holdout="samples")
     with pytest.raises(UsageError, match="seed is -1; expected a number from 0"):
         build(store, tmp_path, seed=-1)
-
-
-def test_the_fused_velocity_can_be_the_label(store, tmp_path):
-    recipe = Recipe(label=LabelConfig(velocity="fused"))
-    add(store, recipe=recipe)
-    build(store, tmp_path, page=True, recipe=recipe)
-    assert open_dataset(tmp_path / "out")["train"].labels[:, 1].min() >= 0.9
-
-
-def test_a_map_of_height_alone_has_no_other_layers(tmp_path):
-    store = open_world(tmp_path, layers=())
-    add(store)
-    build(store, tmp_path, page=True)
-    train = open_dataset(tmp_path / "out")["train"]
-    assert train.channels == ("height",)
-    assert train.patches.shape[1:] == (40, 40, 1)
-    assert train.samples["terrain_class"].null_count == len(train)
 
 
 def test_a_place_that_cannot_be_written(store, tmp_path):

@@ -19,7 +19,6 @@ from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
-from tcpipe.stages.sample import separate_frames
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import select_findings
 
@@ -165,26 +164,6 @@ def test_the_first_map_of_a_store_gives_its_datasets_patches_unless_they_were_de
         build(bare, tmp_path / "other", map="site", without_patches=True)
 
 
-def test_parquet_without_patches_has_a_file_of_samples_for_each_split(bare, tmp_path):
-    add_run(bare, "a", make_segments("a", [1.0, 12.0]))
-    card = build(bare, tmp_path / "out", format="parquet").card
-    assert {shard.split for shard in card.shards} == {"train", "test"}
-    tables = [pq.read_table(tmp_path / "out" / shard.path) for shard in card.shards]
-    assert sorted(name for table in tables for name in table.column("sample_id").to_pylist()) == sorted(
-        read(tmp_path / "out")
-    )
-    assert len(open_dataset(tmp_path / "out")["train"]) == card.splits["train"]
-
-
-def test_without_coordinates_and_patches_no_place_on_earth_is_left(bare, tmp_path):
-    add_run(bare, "a", make_segments("a", [1.0, 12.0]))
-    build(bare, tmp_path / "out", without_coordinates=True)
-    table = read_samples(tmp_path / "out")
-    assert not set(POSITIONS) & set(table.column_names)
-    assert table.column("map").null_count == table.column("height_min_m").null_count == table.num_rows
-    assert len(open_dataset(tmp_path / "out")["train"]) > 0
-
-
 def test_runs_without_gnss_are_split_and_audited_each_in_its_own_frame(bare, tmp_path, region):
     for number in range(
         2
@@ -218,16 +197,6 @@ def test_a_map_needs_positions_and_the_error_says_how_to_go_without(store, tmp_p
     with pytest.raises(DatasetError, match=r"none with GNSS; .*--without-patches"):
         build(store, tmp_path / "out")
     assert build(store, tmp_path / "out", without_patches=True).card.samples == 28
-
-
-def test_frames_are_placed_side_by_side_whatever_their_origins():
-    frame = np.array([0, 0, 1, 1, 2])
-    points = np.array([[-30.0, 5.0], [170.0, 1.0], [-1000.0, 2.0], [-990.0, 2.0], [40.0, 0.0]])
-    (moved,) = separate_frames(frame, [points])
-    assert moved[:, 1].tolist() == points[:, 1].tolist()
-    assert ((moved - points)[:, 0] % 100.0 == 0.0).all()
-    assert np.diff(moved[:, 0])[[0, 2]].tolist() == [200.0, 10.0]
-    assert (np.diff(moved[:, 0])[[1, 3]] > 50.0).all()
 
 
 def test_every_command_on_a_dataset_does_without_patches_and_power(bare, tmp_path):

@@ -14,7 +14,6 @@ from synthetic_store import add_run, lanes, segments, small_store
 import tcpipe
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.place import open_place
-from tcpipe.pipeline.dataset import writing
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
@@ -99,39 +98,6 @@ def test_a_second_night_builds_there_and_readers_see_it_while_an_earlier_one_fin
     assert len(earlier["train"].patches) == len(earlier["train"]), "read after the second was there"
     assert verify(URL).problems == ()
     assert len(diff(f"{URL}/builds/{first.name}", URL).causes) > 0, "the folder of a build is a dataset itself"
-
-
-def test_what_a_copy_put_there_is_read_and_the_next_build_is_beside_it(made, bucket):
-    put(made, bucket)
-    before = files(bucket[0] / "by name" / "ds")
-    assert build_dataset(URL, store=made / "store", recipe=Recipe()).status == "unchanged"
-    assert files(bucket[0] / "by name" / "ds") == before
-    build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7, force=True)
-    now = files(bucket[0] / "by name" / "ds")
-    assert {name: now[name] for name in before} == before
-    (build,) = folders(bucket)
-    assert tcpipe.open_dataset(URL).card.inputs == json.loads((build / "dataset.json").read_text())["inputs"]
-    assert verify(URL).problems == ()
-
-
-def test_a_build_of_another_call_meanwhile_stays(made, bucket, monkeypatch):
-    draw = writing.write_patches
-
-    def while_the_first_draws(*how, **more):
-        monkeypatch.setattr(writing, "write_patches", draw)
-        build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7)
-        return draw(*how, **more)
-
-    monkeypatch.setattr(writing, "write_patches", while_the_first_draws)
-    with pytest.raises(StoreError, match="another call has built a dataset here meanwhile and it is kept"):
-        build_dataset(URL, store=made / "store", recipe=Recipe())
-    assert len(folders(bucket)) == 1
-
-
-def test_the_pointer_names_no_machine(made, bucket):
-    build_dataset(URL, store=made / "store", recipe=Recipe())
-    (pointer,) = (bucket[0] / "by name" / "ds").glob("current.*.json")
-    assert json.loads(pointer.read_text()).keys() == {"folder", "card"}
 
 
 def test_verify_names_what_is_of_no_build_and_a_damaged_pointer(made, bucket):

@@ -14,10 +14,9 @@ from tcpipe.formats.dataset_card import RunSource, group_dataset_findings, judge
 from tcpipe.formats.finding_lines import format_groups
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.card import count_flagged
-from tcpipe.pipeline.diff import diff
 from tcpipe.recipe import Recipe
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
+from tcpipe.tables.findings import Subject, make_finding, select_findings
 
 DRAWS_DATASET_PAGES = True
 
@@ -43,17 +42,6 @@ def test_findings_of_one_code_are_one_line_with_how_many_runs_and_the_range():
         "[driven-below-limit]"
     )
     assert more == "and 1 note: inspect"
-
-
-def test_the_worst_comes_first_and_at_most_eight_lines():
-    own = [
-        make_finding("split-empty", Subject("split", "train"), severity="error", names={"reason": "region_too_small"})
-    ]
-    unknown = [Finding(f"code-{n}", "warning", ROLE, "kept") for n in range(12)]
-    told = lines(run("a", 1, *unknown), own=own)
-    assert told[0].startswith("error: train: no samples")
-    assert len(told) == 9
-    assert told[-1] == "and 5 more findings: inspect"
 
 
 def test_findings_of_the_dataset_on_runs_count_runs_that_are_left_out():
@@ -127,17 +115,6 @@ def test_the_page_has_one_verdict_with_the_worst_first_and_no_praise(built):
     assert severities == sorted(severities, key=["error", "warning", "note"].index)
     assert "Good" not in box
     assert f'"flags":{int(Quality.WEAK_GNSS)}' in page  # the bit of all samples colours nothing
-
-
-def test_a_difference_between_two_datasets_names_findings_by_code_and_subject(built, tmp_path):
-    store = open_world(tmp_path)
-    add_run(store, "a", segments("a", *lanes([0.0], -10.0, 10.0)), findings=(make_finding("no-command", ROLE),))
-    build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    found = diff(built[1], tmp_path / "out")
-    assert "driven-below-limit" in {of.code for of in found.findings_gone}
-    assert {of.subject for of in select_findings(found.findings_new, "no-command")} == {ROLE}
-    assert not select_findings((*found.findings_gone, *found.findings_new), "few-samples")
-    assert "gone: warning: command: " in str(found) or "gone: warning: " in str(found)
 
 
 @pytest.mark.parametrize("holdout", ["sample", "block", "run"])

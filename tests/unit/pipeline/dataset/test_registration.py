@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import rasterio
 from made_tracks import with_columns
-from physics_model import PhysicsModel
 from raster_commands import run_rio
 from synthetic_store import (
     GEOID_M,
@@ -24,8 +23,6 @@ from tcpipe.errors import MapError
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.planning.drives import compute_drive_cost, evaluate_drives, find_drive
-from tcpipe.planning.path_files import choose_map
 from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Subject, select_findings
@@ -98,34 +95,6 @@ def test_the_shift_is_said_and_a_run_without_one_is_not_moved(moved):
     assert refused.names["reason"] == "too few points on the map"
     assert [of.run_id for of in result.card.maps[0].registration] == ["off"]
     assert describe_finding(said).startswith("off: moved by 1.7")
-
-
-def test_whole_drives_are_moved_as_the_runs_of_the_dataset(moved, tmp_path):
-    directory, _ = moved
-    data, out = open_dataset(directory / "out"), tmp_path / "out"
-    source = choose_map(directory / "store", None)
-    found = evaluate_drives(PhysicsModel(), data, source, ["off", "short"], store=directory / "store", out=out)
-    there = open_store(directory / "there")
-    truth = compute_drive_cost(PhysicsModel(), source, find_drive(there, "off"), data, log="off")
-    off = compute_drive_cost(
-        PhysicsModel(), source, find_drive(open_store(directory / "store"), "off"), data, log="off"
-    )
-    moved_drive = found.values.drives[0]
-    error, unmoved = (abs(of.energy_joule.predicted - truth.energy_joule.predicted) for of in (moved_drive, off))
-    assert error < 0.1 * unmoved
-    (said,) = select_findings(found.values.findings, "map-aligned")
-    (refused,) = select_findings(found.values.findings, "map-not-aligned")
-    assert (said.subject.name, refused.subject.name) == ("off", "short")
-    assert "not moved onto map site: too few points" in str(found)
-
-
-def test_the_deviation_of_a_shift_counts_in_whole_drives(moved):
-    directory, _ = moved
-    data, source = open_dataset(directory / "out"), choose_map(directory / "store", None)
-    run = find_drive(open_store(directory / "store"), "off")
-    vague = compute_drive_cost(PhysicsModel(), source, run, data, log="off", shifts={"off": (0.0, 0.0, 0.2)})
-    assert vague.compared_m == 0.0
-    assert vague.rest_m["position_uncertain"] == vague.segments_m
 
 
 @pytest.mark.parametrize(
@@ -221,15 +190,6 @@ def test_a_scale_below_the_limit_is_named(tmp_path):
     found = build_with(tmp_path, track_at(winding(), winding(), scale=1.18))
     (scaled,) = select_findings(found.findings, *HEIGHTS)
     assert (scaled.code, scaled.numbers["map_rise_m"]) == ("map-height-scale", pytest.approx(0.85, abs=0.005))
-
-
-def test_heights_of_one_run_in_feet_do_not_blame_the_map(tmp_path):
-    store = open_world(tmp_path)
-    add_run(store, "a", segments("a", *lanes([0.0], -10.0, 10.0)), track=track_at(winding(), winding()))
-    feet = track_at(winding(), winding(), scale=3.28084)
-    add_run(store, "b", segments("b", *lanes([2.0], -10.0, 10.0), start_ns=10**13), track=feet)
-    found = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    assert [of.subject.name for of in select_findings(found.findings, "map-height-scale")] == ["b"]
 
 
 def test_ground_that_is_not_the_maps_is_a_warning(tmp_path):

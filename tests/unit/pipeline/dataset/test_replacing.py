@@ -6,13 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from object_gateway import in_environment
 from storage_server import object_store
 from stored_files import read_files as tree
-from synthetic_store import add_run, add_world, box, lanes, region_file, segments, tag_run
+from synthetic_store import add_run, add_world, box, lanes, region_file, segments
 
-from tcpipe.cli import cli
 from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.pipeline.dataset import writing
@@ -98,12 +96,6 @@ def test_regions_and_tables_differ_by_what_they_are(here):
     assert len(refused(here, split=None, seed=3, map=["site", "yard"])) == 3
 
 
-def test_the_same_region_written_otherwise_is_the_same_option(here):
-    path = here / "region.geojson"
-    path.write_text(json.dumps(json.loads(path.read_text()), indent=3))
-    assert build_dataset(here / "dataset", **usual(here)).status == "unchanged"
-
-
 DESKTOP_FILES = (".directory", ".DS_Store", "overview.png.aux.xml", "patches.zarr/Thumbs.db")
 OWN_FILES = ("notes.txt", "figures/a.svg")
 
@@ -176,13 +168,6 @@ def test_the_record_of_inputs_is_read_as_it_was_written(here):
     assert read_card(here / "b").made_from.map_names == ("yard", "site")
 
 
-def test_diff_names_other_tags_of_a_run(here):
-    store = open_store(here / "store")
-    tag_run(store, "dry", {"soil": "clay"})
-    build_dataset(here / "b", **usual(here))
-    assert diff(here / "dataset", here / "b").causes == ("run: dry.tags.soil none → clay",)
-
-
 def test_other_runs_and_another_map_of_the_name_are_built_in_unasked(here):
     assert build_dataset(here / "dataset", **usual(here)).status == "unchanged"
     store = open_store(here / "store")
@@ -209,18 +194,6 @@ def test_a_dataset_of_another_data_model_is_left_alone(here):
     with pytest.raises(DatasetError, match="is not changed, because its inputs are unknown") as caught:
         build_dataset(here / "dataset", **usual(here, force=True))
     assert "made by tcpipe 1.x (data model 3.0), expected 4.0: ingest the logs again" in caught.value.problems[0]
-
-
-def test_a_dataset_of_another_data_model_in_a_bucket_is_left_alone(here, monkeypatch):
-    shutil.copytree(here / "dataset", here / "served" / "sets" / "ds")
-    reseal(here / "served" / "sets" / "ds", data_model_version="3.0")
-    with object_store(here / "served") as (environment, _):
-        in_environment(monkeypatch, environment, here / "cache")
-        with pytest.raises(DatasetError) as caught:
-            build_dataset("s3://sets/ds", **usual(here, force=True))
-    other, move = caught.value.problems
-    assert other == "s3://sets/ds: made by tcpipe 1.x (data model 3.0), expected 4.0: ingest the logs again"
-    assert move == "s3://sets/ds: is not changed, because its inputs are unknown; move it or give another OUT"
 
 
 def test_a_dataset_without_coordinates_does_not_store_its_options(here):
@@ -277,17 +250,6 @@ def test_what_another_call_builds_there_meanwhile_stays(here, monkeypatch):
     with pytest.raises(StoreError, match="another call has built a dataset here meanwhile and it is kept"):
         build_dataset(out, **usual(here))
     assert [entry.name for entry in read_card(out).maps] == ["yard"]
-
-
-def test_the_command_says_each_difference_and_ends_with_2(here, monkeypatch):
-    monkeypatch.chdir(here)
-    told = CliRunner().invoke(
-        cli, ["build-dataset", "dataset", "--store", "store", "--map", "yard", "--tag", "weather=dry"]
-    )
-    assert isinstance(told.exception, UsageError)
-    _, by_map, by_region = told.exception.problems
-    assert by_map == "dataset: --map: site in the dataset, yard now"
-    assert by_region.startswith("dataset: --split: train_test (")
 
 
 def test_the_options_are_compared_as_data_and_not_by_how_they_are_written(here):

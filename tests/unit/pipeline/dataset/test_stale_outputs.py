@@ -41,19 +41,6 @@ def test_a_changed_recipe_file_makes_the_dataset_of_a_command_outdated(store, tm
     assert list_stale(store) == []
 
 
-def test_a_recipe_file_where_none_was_makes_it_outdated_too(store, tmp_path):
-    text = (tmp_path / "tcpipe.toml").read_text()
-    (tmp_path / "tcpipe.toml").unlink()
-    assert build().exit_code == 0
-    (tmp_path / "tcpipe.toml").write_text(text)
-    assert list_stale(store) == [("output-outdated", "recipe")]
-
-
-def test_an_option_of_zero_is_an_option(store):
-    assert build("--seed", "0").exit_code == 0
-    assert list_stale(store) == []
-
-
 def test_a_recipe_that_cannot_be_read_is_in_the_record_of_the_call(store, tmp_path):
     (tmp_path / "tcpipe.toml").write_text("[split]\nsed = 5\n")
     with pytest.raises(RecipeError):

@@ -13,7 +13,6 @@ from stored_files import read_files
 from synthetic_store import add_run, box, lanes, open_world, region_file, segments
 from written_bytes import written_bytes
 
-import tcpipe
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_files import read_card, read_samples
@@ -22,9 +21,7 @@ from tcpipe.formats.json_files import to_json
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.without_coordinates import keep_public
-from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
-from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.report.dataset_report import find_nearest_train_m
 from tcpipe.splits.assignment import SPLITS
@@ -274,31 +271,6 @@ def test_no_field_of_a_finding_passes_unless_the_catalogue_calls_it_public(kind)
         assert keep_public([kept], {}) == (kept,), code
     (run,) = keep_public([Finding("topic-not-used", "note", Subject("run", "north"), "kept")], {"north": "run0001"})
     assert run.subject.name == "run0001"
-
-
-def test_the_bytes_do_not_depend_on_jobs_or_on_the_name_of_the_directory(built, tmp_path):
-    here, *_ = built
-    how = {"store": here / "store", "split": here / "region.geojson", "covariates": here / "secretstation.csv"}
-    build_dataset(tmp_path / "again", **how, format="parquet", without_coordinates=True, jobs=2)
-    assert read_files(tmp_path / "again") == read_files(here / "public")
-
-
-def test_it_is_opened_reported_trained_evaluated_and_compared(built, tmp_path):
-    here, *_ = built
-    full, public = open_dataset(here / "full"), open_dataset(here / "public")
-    np.testing.assert_array_equal(public["train"].patches, full["train"].patches)
-    assert [found.changed for found in report(here / "public")] in ([True], [False])
-    told = []
-    for name in ("full", "public"):
-        tcpipe.train(here / name, tmp_path / f"model-{name}", model="linear")
-        told.append(tcpipe.evaluate(tmp_path / f"model-{name}", here / name, tmp_path / f"evaluation-{name}").values)
-    for split in told[0].splits:
-        was, now = (each.splits[split] for each in told)
-        assert now.leakage == was.leakage
-        assert now.errors["E"]["all"].rmse == pytest.approx(was.errors["E"]["all"].rmse, rel=1e-6)
-    assert diff(here / "public", here / "public").same
-    with pytest.raises(DatasetError, match="its samples have no column 'start_lon_deg'"):
-        public["train"].column("start_lon_deg")
 
 
 def test_what_needs_coordinates_or_names_says_so(built):
