@@ -305,6 +305,15 @@ def test_a_dataset_that_lost_a_file_is_built_again(store, tmp_path):
     assert (tmp_path / "out" / "samples.parquet").exists()
 
 
+def test_holdout_and_seed_overrule_the_recipe(store, tmp_path):
+    add(store)
+    sample = build(store, tmp_path, holdout="sample")
+    assert (sample.card.splits["train"], sample.card.splits["test"]) == (16, 4)
+    first = set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist())
+    build(store, tmp_path, holdout="sample", seed=1, force=True)
+    assert set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist()) != first
+
+
 def test_one_run_cannot_be_held_out_and_it_is_said(store, tmp_path):
     add(store)
     result = build(store, tmp_path, page=True, holdout="run")
