@@ -458,10 +458,3 @@ def test_an_offset_of_a_role_that_is_not_there_is_an_error_and_a_placement_a_war
     assert unused_key.names == {"key": "read.extrinsics.gnss"}
 
 
-def test_currents_of_the_other_sign_are_cured_by_the_line_as_it_is_printed(drive, tmp_path):
-    other = drive.changed("power", lambda c: {name: -values for name, values in c.items() if "current" in name})
-    labelled = run(other, tmp_path)
-    (rejected,) = select_findings(labelled.info.report.findings, "power-rejected")
-    cured = run(other, tmp_path, recipe_that_follows(rejected).read)
-    assert not select_findings(cured.info.report.findings, "power-rejected")
-    assert_labels_hold(cured, drive.truth)

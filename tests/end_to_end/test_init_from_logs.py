@@ -1,6 +1,6 @@
 """A robot without a profile: ``init --from`` its log, at most two lines edited, and ``ingest`` gives labels with energy.
 
-Six robots, of one simulated drive each; their energies are compared with the truth.
+Four robots, of one simulated drive each; their energies are compared with the truth.
 """
 
 import re
@@ -16,7 +16,6 @@ from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.formats.recipe_toml import parse_recipe, parse_toml
 from tcpipe.simulation.route import Wander
 
-ESC = "std_msgs/Header header\nfloat32 voltage\nfloat32 current\nint32 rpm\nfloat32 temperature\n"
 SOLUTION = "std_msgs/Header header\nfloat64 lat\nfloat64 lon\nfloat32 height\nuint8 quality\n"
 WHEELS = [f"{end}_{side}_wheel_joint" for end in ("front", "rear") for side in ("left", "right")]
 HUSKY = {"gnss": "[0.1, 0.0, 0.9]", "imu": "[0.05, -0.1, 0.3], rpy_rad = [3.1416, 0.0, 1.5708]"}
@@ -55,28 +54,6 @@ def watts(drive):
         *renamed(drive, "power"),
         MessageStream("/base/power_w", "std_msgs/msg/Float32", stamp_ns, {"data": volt * amp}),
     ]
-
-
-def escs(drive):
-    stamp_ns, volt, amp, right = power_at(drive)
-    each = []
-    for number, share in enumerate((right, right, 1.0 - right, 1.0 - right)):
-        columns = stamped(stamp_ns, voltage=volt, current=amp * share / 2)
-        each.append(MessageStream(f"/esc_{number}/status", "esc_msgs/msg/EscStatus", stamp_ns, columns, definition=ESC))
-    return [*renamed(drive, "power"), *each]
-
-
-def vescs(drive):
-    stamp_ns, volt, amp, right = power_at(drive)
-    joule = np.diff(stamp_ns, prepend=stamp_ns[0]) / 1e9 * volt * amp
-    sides = []
-    for side, share in (("right", right), ("left", 1.0 - right)):
-        drawn, given = (np.cumsum(np.maximum(sign * joule * share, 0.0)) / 3600 for sign in (1, -1))
-        values = {"voltage_input": volt, "current_input": amp * share, "current_motor": 3 * amp * share}
-        values |= {"energy_drawn": drawn, "energy_regen": given}
-        columns = stamped(stamp_ns, **{f"state.{name}": of for name, of in values.items()})
-        sides.append(MessageStream(f"/{side}/core", "vesc_msgs/msg/VescStateStamped", stamp_ns, columns))
-    return [*renamed(drive, "power"), *sides]
 
 
 def joints(drive):
@@ -121,8 +98,6 @@ def followed(text, *, removing):
     ("robot", "removing", "tolerance"),
     [
         (watts, ("power", "power_sources"), 0.03),
-        (escs, (), 0.03),
-        (vescs, (), 0.03),
         (joints, ("power_sources",), 0.1),
         (own_fixes, ("gnss.quality",), 0.03),
         (unplaced, ("gnss", "imu"), 0.03),
@@ -164,19 +139,6 @@ def test_inspect_preflight_and_init_propose_the_same(drive, tmp_path):
 
 def without_values(text):
     return re.sub(r"(?<=messages), [^;\n]*", "", text)
-
-
-def test_ingest_prints_the_lines_that_inspect_proposes_for_power(drive, tmp_path):
-    log = tmp_path / "run.mcap"
-    write_mcap(log, watts(drive))
-    lines = [line.strip() for line in run("ingest", log, "--store", tmp_path / "store").output.splitlines()]
-    assert any("/base/power_w" in line and line.endswith("[power-candidates]") for line in lines)
-    printed = [line for line in lines if line.startswith("[") or " = " in line]
-    proposed = run("inspect", log).output.partition("# Proposed by tcpipe")[2].partition("\n")[2].splitlines()
-    values = parse_toml(
-        "\n".join(line.removeprefix("# ") for line in proposed if line.startswith("[") or " = " in line)
-    )
-    assert parse_toml("\n".join(printed)) == {key: values[key] for key in ("read", "power_sources")}
 
 
 def test_a_recipe_settles_what_inspect_and_preflight_propose(drive, tmp_path):

@@ -101,10 +101,6 @@ def test_robot_recipe_and_age_are_heard(place: Path, tmp_path: Path) -> None:
     assert [group["state"] for group in groups if group["logs"]] == ["growing"]
 
 
-def test_a_dataset_does_not_differ_from_itself(place: Path) -> None:
-    assert answer("diff", "dataset", "dataset", cwd=place)["same"]
-
-
 def test_the_store_is_named_in_the_same_way_everywhere(place: Path) -> None:
     for command in (("inspect",), ("verify",), ("report", "--no-runs"), ("status",)):
         by_option = tcpipe(*command, "--store", "store", cwd=place)

@@ -118,11 +118,6 @@ def test_a_route_graph_gets_the_costs_of_its_edges(place: Path):
         (("cost-map", "model", "--cell-size", "0"), 2, "--cell-size"),
         (("cost-map", "model", "--speed", "0.5"), 2, "has no input for the commanded speed"),
         (
-            ("predict-path", "model", "--path", "path.geojson", "--speed", "0.5"),
-            2,
-            "has no input for the commanded speed",
-        ),
-        (
             ("plan-path", "model", "--from", _FROM, "--to", _TO, "--speed", "0.5"),
             2,
             "has no input for the commanded speed",

@@ -7,7 +7,7 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import pytest
-from installed_command import plain_lines, tcpipe
+from installed_command import tcpipe
 
 from tcpipe.simulation import find_scenario, scenarios
 
@@ -82,13 +82,6 @@ def test_the_benchmark_has_every_kind_and_resumes(reproduced):
     assert same["rmse"] == whole["rmse"]
 
 
-def test_the_page_says_that_the_data_are_simulated(reproduced):
-    here, _ = reproduced
-    page = (here / "here" / "reproduction.html").read_text()
-    assert "The data are simulated" in page
-    assert "the small site" in page
-
-
 def test_even_a_quick_network_learns_that_slope_costs_time(reproduced):
     here, _ = reproduced
     values = json.loads((here / "here" / "dataset" / "resnet18-0" / "evaluation" / "evaluation.json").read_text())
@@ -126,13 +119,3 @@ def test_train_and_evaluate_by_hand(reproduced):
     assert trained.returncode == 0, trained.stderr
     done = tcpipe("evaluate", "model", "here/dataset", "--noise-draws", "1", "--json", cwd=here, env=ENV)
     assert set(json.loads(done.stdout)["splits"]) == {"test", "unseen"}
-
-
-def test_bad_input_is_one_plain_line(reproduced):
-    here, _ = reproduced
-    assert "there is no such directory" in plain_lines(tcpipe("train", "nowhere", cwd=here, env=ENV), 2)
-    nowhere = tcpipe("evaluate", "nowhere", "here/dataset", cwd=here, env=ENV)
-    assert "there is no such directory" in plain_lines(nowhere, 2)
-    (here / "mine").mkdir()
-    (here / "mine" / "thesis.txt").write_text("important")
-    assert "is no reproduction" in plain_lines(tcpipe("reproduce", "mine", "--quick", cwd=here, env=ENV), 2)

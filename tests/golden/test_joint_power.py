@@ -155,7 +155,6 @@ def test_efforts_that_are_missing_leave_segments_without_energy(drive, tmp_path)
     [
         (lambda torque: np.full_like(torque, np.nan), RECIPE, "no-effort.*front_left_wheel"),
         (lambda torque: -np.abs(torque), RECIPE, "torque-against-motion"),
-        (np.zeros_like, RECIPE, "current-constant"),
         (np.asarray, RECIPE.replace("(front|rear)_(left|right)", "middle"), "no-joint.*middle_wheel.*front_left_wheel"),
         (np.asarray, RECIPE + RECIPE.replace("(front|rear)", "front"), "joint-in-two-tables.*front_left_wheel"),
     ],

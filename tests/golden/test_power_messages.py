@@ -166,15 +166,6 @@ def test_a_vesc_that_counts_nothing_tells_its_mean_current(tmp_path):
     assert fallback.names["reason"] == "current-constant"
 
 
-def test_a_counter_that_is_reset_is_said_and_tells_nothing_across_it(tmp_path):
-    joule = 12.0 * np.arange(N)
-    joule[30:] -= joule[30]
-    found = power_of(log_of(tmp_path / "a", "vesc_msgs/msg/VescStateStamped", vesc(joule)))
-    assert np.flatnonzero(np.isnan(watt(found))).tolist() == [0, 30]
-    np.testing.assert_allclose(np.delete(watt(found), [0, 30]), 240.0, rtol=1e-6)
-    assert [of.numbers for of in select_findings(found.findings, "counter-reset")] == [{"resets_count": 1.0}]
-
-
 SCOUT = PowerSource("scout_msgs/msg/ScoutStatus", "battery_voltage", "actuator_states[].current", sign="auto")
 
 

@@ -1,14 +1,10 @@
 """Streams of real recordings, against figures worked out from the same recordings by other means."""
 
-import json
 from pathlib import Path
 
 import numpy as np
-import pyarrow.compute as pc
-import pytest
 from shared_data import shared_data
 
-import tcpipe
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.recipe import Extrinsics, ReadConfig
@@ -16,41 +12,10 @@ from tcpipe.stages.read import read_run
 from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import Streams
 
-_DRIVES = ("/left_drive/battery", "/right_drive/battery")
-
 
 def read(path: Path, robot: str | None = None, **config) -> Streams:
     with open_log(path) as log:
         return read_run(log, ReadConfig(**config), robot=robot, known=load_shipped_profiles())
-
-
-@pytest.mark.parametrize("robot", [None, "warthog"])
-def test_the_energy_of_a_real_warthog(robot: str | None) -> None:
-    path = shared_data("warthog_grass_a/run.mcap")
-    reference = json.loads((path.parent / "reference.json").read_text())
-    found = read(path, robot)
-    assert found.robot == (robot or "generic")
-    assert found.report.facts.left_out.keys() == {"/icp_odom"}
-    assert found.report.facts.power.current_sign == "drawn_positive (mean)"
-    assert sorted(found.tables["power"]["rail"].unique().to_pylist()) == list(_DRIVES)
-    with tcpipe.read_log(path) as log:
-        messages = log.tables(_DRIVES)
-    stamps = messages[_DRIVES[0]]["log_time_ns"].to_numpy()
-    total = sum(table["voltage"].to_numpy() * table["current"].to_numpy() for table in messages.values())
-    assert len(stamps) == reference["rows"]
-    assert np.trapezoid(total, (stamps - stamps[0]) / 1e9) == pytest.approx(reference["E_trapezoid_joule"], rel=1e-6)
-    assert np.mean(total < 0) == pytest.approx(reference["negative_power_fraction"], abs=1e-9)
-    # The messages repeat readings at 1 Hz: each reading, held until the next one, is what the messages state.
-    for drive, table in messages.items():
-        readings = found.tables["power"].filter(pc.equal(found.tables["power"]["rail"], drive))
-        for column, field in (("voltage_volt", "voltage"), ("current_amp", "current")):
-            known = readings.filter(pc.is_valid(readings[column]))
-            row = np.searchsorted(known["stamp_ns"].to_numpy(), stamps, side="right") - 1
-            assert np.mean(row >= 0) > 0.99
-            np.testing.assert_array_equal(known[column].to_numpy()[row[row >= 0]], table[field].to_numpy()[row >= 0])
-    imu = found.tables["imu"]
-    assert imu["quat_w"].null_count == imu.num_rows  # it says that it has no orientation
-    assert abs(np.mean(imu["linear_acceleration_z_mps2"].to_numpy()) - 9.8) < 0.1
 
 
 def test_a_real_husky_without_power() -> None:

@@ -49,12 +49,6 @@ def test_a_task_that_kills_its_workers_is_named(cluster, caplog):
     assert "a task ended without a result (KilledWorker: " in caplog.text
 
 
-def test_a_closed_iterator_leaves_no_task_waiting(cluster):
-    with closing(run_all(where, range(100), jobs=1, cluster=cluster.address)) as outcomes:
-        next(outcomes)
-    assert len(list(run_all(where, range(2), jobs=1, cluster=cluster.address))) == 2
-
-
 def test_a_worker_of_another_version_is_refused(cluster, monkeypatch):
     monkeypatch.setattr(execution, "__version__", "99.0")
     with pytest.raises(UsageError, match=f"a worker has tcpipe {tcpipe.__version__}, expected 99.0 as here"):

@@ -5,10 +5,8 @@ import inspect
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 
 import click
 import numpy as np
@@ -23,10 +21,6 @@ from tcpipe.cli import cli
 from tcpipe.errors import UsageError
 from tcpipe.learning.evaluation import EvaluateConfig
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.models import load_model
-from tcpipe.planning import drives
-from tcpipe.planning.path_files import choose_map
-from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 
 STUB = Path(tcpipe.__file__).with_suffix(".pyi")
@@ -99,20 +93,6 @@ def test_a_function_refuses_what_its_command_refuses(name, keyword, bounds, tmp_
         if not (bounds.min_open and value == bounds.min):
             with pytest.raises(UsageError, match=r"gone|no store here"):
                 getattr(tcpipe, FUNCTIONS[name])("gone", *ends, **{keyword: value})
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: tcpipe.train("gone", model="forest"),
-        lambda: tcpipe.train("gone", model="physics", loss="mse", label="net"),
-        lambda: tcpipe.plan_path("gone", (15.0, 47.0), (15.1, 47.0), objective="fuel"),
-        lambda: tcpipe.plan_path("gone", (15.0, float("nan")), (15.1, 47.0)),
-    ],
-)
-def test_a_word_that_is_no_choice_is_refused(call):
-    with pytest.raises(UsageError, match="expected"):
-        call()
 
 
 @pytest.mark.parametrize(
@@ -206,14 +186,3 @@ def test_a_model_is_adapted_by_runs_of_the_store(place, monkeypatch):
     assert adapted["duration_s"] == pytest.approx(plain["duration_s"], rel=0.05)
     low, high = adapted["energy_interval_joule"]
     assert low < adapted["energy_joule"] < high
-
-    # The recipe of the dataset says whether they are moved onto the map (where "south" lies is patched).
-    aligned = replace(Recipe(), sample=replace(Recipe().sample, align=True))
-    there = SimpleNamespace(run_id="south", shift_xy_m=(1.0, 0.0), applied_std_m=0.02)
-    monkeypatch.setattr(drives, "register_runs", lambda _runs, _source, _recipe: ((there,), []))
-    given = load_model("adaptable"), choose_map(store, None), open_store(store), ["south"]
-    still, moved = (
-        drives.collect_runs(*given, SimpleNamespace(card=SimpleNamespace(recipe=recipe, runs=())))[0].metres["energy"]
-        for recipe in (Recipe(), aligned)
-    )
-    assert not np.array_equal(still.predicted[:20], moved.predicted[:20])

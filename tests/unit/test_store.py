@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -36,45 +35,6 @@ def put(store: Store, length_m: float = 10.0, name: str = RUN, **how: object) ->
 def counted(store: Store) -> list[int]:
     """Segments of each run, as a reader finds them."""
     return [run.segments().num_rows for run in store.runs()]
-
-
-class _Killed(BaseException):
-    pass
-
-
-def test_killed_at_any_step_a_reader_finds_the_run_before_and_the_next_call_completes(root, monkeypatch):
-    left = [0]
-
-    def step():
-        if not left[0]:
-            raise _Killed
-        left[0] -= 1
-
-    def killing(act):
-        def acts(*args, **how):
-            step()
-            found = act(*args, **how)
-            step()
-            return found
-
-        return acts
-
-    store = open_store(root, create=True)
-    put(store)
-    with monkeypatch.context() as patch:
-        for name in ("put", "put_files", "delete"):
-            patch.setattr(Place, name, killing(getattr(Place, name)))
-        for steps in range(100):
-            left[0] = steps
-            with suppress(_Killed):
-                put(store, 12.0)
-                break
-            assert counted(store) in ([10], [12])
-    assert steps > 3
-    assert counted(store) == [12]
-    state = store.scan()
-    assert state.damaged == []
-    assert all(state.has_payload(row) for row in state.list_rows())
 
 
 def test_a_run_that_is_written_again_replaces_the_one_before_and_recipes_live_side_by_side(root):

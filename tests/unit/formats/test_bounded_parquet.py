@@ -69,22 +69,6 @@ def test_small_files_that_become_large_are_refused_before_they_do(tmp_path):
                 read_table(path, group=0)
 
 
-def test_a_page_that_says_it_is_larger_than_its_footer_does_is_refused(tmp_path):
-    """Arrow makes room for what the header of a page says."""
-    path = tmp_path / "a.parquet"
-    write_table(pa.table({"a": np.arange(20_000.0)}), path)
-    data = bytearray(path.read_bytes())
-    at = pq.read_metadata(path).row_group(0).column(0).data_page_offset
-    size = data.index(b"\x15", at + 1)  # field 2 of the header: the size without compression, a varint of 3 bytes
-    assert data[at] == 0x15
-    assert data[size + 3] < 0x80
-    data[size + 1 : size + 4] = b"\xfe\xff\xff"  # goes on
-    data[size + 4 : size + 4] = b"\xff\x0f"
-    path.write_bytes(data)
-    with pytest.raises(StoreError):
-        read_table(path, ["a"])
-
-
 @pytest.mark.parametrize("rows", [0, 1, 3, 5000])
 def test_what_is_written_is_read_whatever_it_holds(tmp_path, rows):
     table = pa.table(

@@ -118,21 +118,6 @@ def test_the_highest_number_counts_and_a_writer_takes_one_more(place):
     assert scan_anew(place).find_tags("a log") == found.find_tags("a log") == {"soil": "snow"}
 
 
-def test_of_one_number_the_smallest_digest_counts_whoever_writes_first(place):
-    names = [put(place, State(), tags(soil=soil)) for soil in ("dry", "wet", "snow")]
-    found = scan_anew(place)
-    assert found.names["tags", KEY] == min(names)
-    assert sorted(found.beaten) == sorted(names)[1:]
-    assert read_record(place, min(names), Tags).tags == found.find_tags("a log")
-
-
-def test_what_a_call_writes_is_in_its_state_as_a_scan_finds_it(place):
-    state = put_many(place, 3)
-    put(place, state, tags(soil="dry"))
-    put(place, state, tags(soil="wet"))
-    assert describe(state) == describe(scan_anew(place))
-
-
 def test_bytes_that_differ_from_their_digest_are_no_document_and_the_one_before_counts(place):
     state = scan(place)
     names = [put(place, state, tags(soil=soil)) for soil in ("dry", "wet", "snow")]
@@ -232,14 +217,6 @@ def test_a_document_that_is_deleted_does_not_count_although_this_process_has_rea
     assert scan(here).find_tags("log 1") == {}
 
 
-def test_two_stores_that_a_process_reads_in_turn_are_not_mixed(tmp_path):
-    first, second = Place(tmp_path / "a"), Place(tmp_path / "b")
-    put(first, scan(first), tags(soil="dry"))
-    put(second, scan(second), tags(soil="wet"))
-    for _ in range(2):
-        assert (scan(first).find_tags("a log"), scan(second).find_tags("a log")) == ({"soil": "dry"}, {"soil": "wet"})
-
-
 # --- the index ------------------------------------------------------------------------------------------------------
 
 
@@ -308,23 +285,6 @@ def test_an_index_that_names_documents_which_are_gone_gives_none_of_them(here):
     assert found.find_tags("log 3") == {}
     assert gone not in found.names.values()
     assert found.read == 0
-
-
-@settings(max_examples=30)
-@given(place_in_file=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-def test_an_index_with_a_wrong_bit_changes_no_state(store_of_twenty, place_in_file, bit):
-    here, first, data = store_of_twenty
-    wrong = bytearray(data)
-    wrong[int(place_in_file * len(data))] ^= 1 << bit
-    here.put(INDEX, bytes(wrong))
-    assert describe(scan_anew(here)) == describe(first)
-
-
-@pytest.fixture(scope="module")
-def store_of_twenty(tmp_path_factory):
-    here = Place(tmp_path_factory.mktemp("twenty") / "store")
-    put_many(here, 20)
-    return here, scan_anew(here), index(here)
 
 
 def test_a_store_in_a_bucket_whose_index_is_there_is_scanned_by_listings_and_one_request(tmp_path, served):

@@ -11,7 +11,6 @@ import pytest
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import parse_typed, parse_typed_json, read_as, to_compact_json, to_json, write_json
-from tcpipe.recipe.checking import describe
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +69,6 @@ def test_what_does_not_fit_is_named_by_file_and_key(tmp_path, value, line):
     with pytest.raises(StoreError) as caught:
         read_as(path, Document)
     assert str(caught.value).removesuffix(", got 1") == f"{path}: is not what this version writes: {line}"
-
-
-def test_a_schema_names_every_key_and_its_type():
-    ((schema,), definitions) = describe(Document, file="all.json")
-    assert schema == {"$ref": "all.json#/$defs/Document"}
-    assert definitions["Counts"]["properties"]["segments"] == {"type": "integer"}
-    assert definitions["Document"]["required"] == ["counts"]
 
 
 def test_threads_that_meet_a_document_at_once_all_read_it():

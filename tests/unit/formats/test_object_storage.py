@@ -28,16 +28,6 @@ def bucket(tmp_path, served):
     return root, served
 
 
-def test_a_log_behind_a_url_is_read_as_any_other(bucket):
-    with open_log("s3://drives/field/my run.mcap") as log:
-        stand_in = log.path
-        assert_same(log.table("/ColorRGBA"), expected_columns(MESSAGES, "/ColorRGBA"))
-        assert stand_in.name == "my run.mcap"
-        assert log.size_bytes == (bucket[0] / "field" / "my run.mcap").stat().st_size
-        assert stand_in.stat().st_blocks == 0
-    assert not stand_in.exists()
-
-
 def test_a_prefix_is_a_bag_directory(bucket):
     with open_log("s3://drives/field/bag/") as log:
         assert log.container == "rosbag2"

@@ -1,14 +1,12 @@
 """A directory and a bucket behind the same verbs: each test is made of both, and of a real gateway where there is one."""
 
 import hashlib
-import os
 import pickle
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 from object_gateway import open_bucket
@@ -74,22 +72,6 @@ def test_a_folder_is_deleted_with_all_in_it_and_nothing_beside_it(place: Place) 
     place.delete("blobs/ab")
     assert place.list("blobs") == ["a b"]
     assert place.read("blobs/a b/1") == b""
-
-
-def test_a_deleted_folder_is_whole_or_a_temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    place, seen = Place(tmp_path), list[list[str]]()
-    for name in ("blobs/a/1", "blobs/a/2"):
-        place.put(name, b"")
-    unlink = os.unlink
-
-    def look(*how: Any, **more: Any) -> None:
-        seen.append(place.list("blobs"))
-        unlink(*how, **more)
-
-    monkeypatch.setattr(os, "unlink", look)
-    place.delete("blobs/a")
-    assert seen == [[], []]
-    assert place.list() == ["blobs"], "only what is named goes"
 
 
 def test_what_a_killed_deletion_or_writer_left_is_not_listed_and_goes_when_cleared(tmp_path: Path) -> None:

@@ -192,16 +192,6 @@ def test_a_reader_asks_three_times_however_many_builds_there_are(served):
     assert asked == {3}
 
 
-def test_a_copy_of_a_directory_is_read_until_there_is_a_build(place):
-    place.put(CARD, b'{"text": "copy", "checksums": {}}')
-    place.put("data", b"copy")
-    assert seen(place) == ("copy", "copy")
-    assert find_unlisted_files(place.root) == [place.where("data")]
-    write(place, "built")
-    assert seen(place) == ("built", "built")
-    assert place.read("data") == b"copy"
-
-
 def test_what_is_of_another_kind_is_left_alone(place):
     write(place, "a model", card="model.json")
     before = place.entries()

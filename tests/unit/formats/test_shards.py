@@ -79,18 +79,6 @@ def test_what_zarr_leaves_out_is_fill_value(tmp_path):
         opened(tmp_path / "a.zarr" / "x", theirs).chunk((5, 0, 0))
 
 
-def test_windows_of_a_plane(tmp_path):
-    data = RNG.integers(0, 255, (100, 77), dtype=np.uint8)
-    group = create_group(tmp_path / "m.zarr")
-    plane = add_array(
-        group, "x", shape=data.shape, dtype=np.uint8, chunks=(16, 16), shards=(48, 48), dimensions=("y", "x")
-    )
-    plane[:] = data
-    ours = opened(tmp_path / "m.zarr" / "x", plane)
-    for rows, cols in [((0, 16), (0, 16)), ((3, 60), (20, 77)), ((90, 120), (70, 90)), ((5, 6), (5, 6))]:
-        np.testing.assert_array_equal(ours.window(*rows, *cols), data[slice(*rows), slice(*cols)])
-
-
 @pytest.mark.parametrize("where", ["chunk", "index", "end"])
 def test_a_changed_byte_is_an_error_never_a_number(tmp_path, where):
     theirs = array(tmp_path, np.uint16)

@@ -100,17 +100,6 @@ def test_a_lasting_step_opens_an_epoch_for_every_topic() -> None:
         np.testing.assert_array_equal(found[name].clock_epoch, (rows >= at).astype(int))
 
 
-@pytest.mark.parametrize("step_s", [-5.0, -2.0, 1.0, 2.0, 5.0])
-@pytest.mark.parametrize("every", [6, 12, 20])
-def test_a_lasting_step_is_found_among_late_messages(step_s, every) -> None:
-    log, row = log_times(), np.arange(1200)
-    late_s = np.where(row % every == every // 2, abs(step_s), 0.0)  # as if on the other side of the step
-    header = log + np.round(S * (np.where(row >= 600, step_s, 0.0) - late_s)).astype(np.int64)
-    _, (step,) = settle(topic=times(log, header))
-    assert step.step_s == pytest.approx(step_s, abs=0.01)
-    assert step.log_time_ns == START + 30 * S
-
-
 def test_a_stalled_recorder_is_no_step() -> None:
     header = log_times(rate_hz=200.0)
     log = header.copy()

@@ -4,21 +4,14 @@ import os
 from dataclasses import replace
 
 import numpy as np
-import polars as pl
 import pytest
-from simulated_streams import log_of
 
 from tcpipe.errors import LogError, UsageError
 from tcpipe.formats.finding_lines import describe_finding
-from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.table_log import open_tables
-from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.recipe import Recipe, TableMapping
-from tcpipe.simulation.scenarios import make_tiny
-from tcpipe.stages.read import find_read_config, read_run
-from tcpipe.tables.columns import to_floats, to_integers
 
 START_NS = 1_760_456_485 * 10**9
 
@@ -35,77 +28,7 @@ def odometry(count=50, unit=10**6, start=START_NS, text="t,v,w\n"):
     return text + "".join(f"{(start + k * 20_000_000) // (10**9 // unit)},{0.5 + k % 2},0.1\n" for k in range(count))
 
 
-SAME = {
-    "gnss": TableMapping(
-        "gnss.csv",
-        stamp="time",
-        stamp_zone="UTC",
-        columns={"latitude": "lat_deg", "longitude": "lon_deg", "altitude": "alt_m", "status": "fix_status"}
-        | {f"{axis}_std": axis for axis in ("east", "north", "up")},
-    ),
-    "imu": TableMapping(
-        "imu.parquet",
-        columns={f"angular_velocity_{axis}": f"angular_velocity_{axis}_radps" for axis in "xyz"}
-        | {f"linear_acceleration_{axis}": f"linear_acceleration_{axis}_mps2" for axis in "xyz"},
-    ),
-    "wheel_odometry": TableMapping(
-        "wheels.tsv", columns={"linear_x": "velocity_x_mps", "angular_z": "angular_velocity_z_radps"}
-    ),
-    "power": TableMapping("power.csv", columns={"voltage": "voltage_volt", "current": "current_amp"}),
-}
 WHEELS = TableMapping("odom.csv", columns={"linear_x": "v", "angular_z": "w"})
-
-
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory):
-    scenario = make_tiny(seconds=20.0)
-    return log_of(scenario, scenario.drives[0], tmp_path_factory.mktemp("site"))
-
-
-def test_what_a_bag_holds_is_the_same_as_tables(bag, tmp_path):
-    with open_log(bag) as log:
-        wanted = read_run(log, Recipe().read, robot=None, known=load_shipped_profiles())
-    folder = tmp_path / "drive"
-    folder.mkdir()
-    for role, name in (
-        ("gnss", "gnss.csv"),
-        ("imu", "imu.parquet"),
-        ("wheel_odometry", "wheels.tsv"),
-        ("power", "power.csv"),
-    ):
-        table = wanted.tables[role]
-        frame = pl.DataFrame({n: table[n].to_pylist() for n in table.column_names if n != "rail"})
-        if role == "gnss":
-            frame = frame.with_columns(
-                pl.col("east_var_m2").sqrt().alias("east"),
-                pl.col("north_var_m2").sqrt().alias("north"),
-                pl.col("up_var_m2").sqrt().alias("up"),
-                pl.from_epoch("stamp_ns", time_unit="ns").alias("time"),
-            )
-        if name.endswith("parquet"):
-            frame.write_parquet(folder / name)
-        else:
-            separator = "\t" if name.endswith("tsv") else ","
-            frame.write_csv(folder / name, separator=separator, datetime_format="%Y-%m-%dT%H:%M:%S%.9f")
-    recipe = Recipe(tables=SAME)
-    with open_logs([folder], tables=recipe.tables) as log:
-        assert log.findings == []
-        found = read_run(log, find_read_config(recipe, log.topics), robot=None, known=load_shipped_profiles())
-    for role in ("gnss", "imu", "wheel_odometry", "power"):
-        assert (
-            to_integers(found.tables[role], "stamp_ns").tolist()
-            == to_integers(wanted.tables[role], "stamp_ns").tolist()
-        )
-    for role, names in (
-        ("gnss", ("lon_deg", "lat_deg", "alt_m", "east_var_m2", "up_var_m2")),
-        ("imu", ("angular_velocity_z_radps", "linear_acceleration_x_mps2")),
-        ("wheel_odometry", ("velocity_x_mps", "angular_velocity_z_radps")),
-        ("power", ("voltage_volt", "current_amp")),
-    ):
-        for name in names:
-            np.testing.assert_allclose(
-                to_floats(found.tables[role], name), to_floats(wanted.tables[role], name), rtol=1e-12
-            )
 
 
 def test_all_that_a_mapping_names_in_vain_is_said_at_once(tmp_path):

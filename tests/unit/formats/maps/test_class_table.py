@@ -1,11 +1,9 @@
 """Class tables as CSV and TOML."""
 
-import json
 
 import numpy as np
 import pytest
 import rasterio
-from map_worlds import write_tif
 from rasterio import Affine
 
 from tcpipe.errors import MapError
@@ -84,9 +82,6 @@ def test_what_is_no_class_table_is_refused_in_a_few_lines(tmp_path, name, text, 
     assert len(caught.value.problems) <= 21
 
 
-SMALL = Affine(1.0, 0.0, 560_000.0, 0.0, -1.0, 5_215_000.0)
-
-
 def sparse(path, rows, cols, pixel_size_m):
     """A raster of any size in a few kilobytes."""
     profile = {"driver": "GTiff", "height": rows, "width": cols, "count": 1, "dtype": "float32", "crs": "EPSG:32633"}
@@ -120,13 +115,3 @@ def test_a_map_that_is_mostly_empty_is_made_of_what_it_has(tmp_path):
     assert len(list((tmp_path / "m.zarr/height/c").rglob("*/*"))) == 1
 
 
-def test_very_many_polygons_on_one_place_are_told_without_holding_each_against_each(tmp_path):
-    height = write_tif(tmp_path / "h.tif", np.ones((1, 100, 100), np.float32), "EPSG:32633", SMALL)
-    corners = rasterio.warp.transform_geom("EPSG:32633", "EPSG:4326", {"type": "Polygon", "coordinates": [[
-        [560_000.0, 5_214_900.0], [560_100.0, 5_214_900.0], [560_100.0, 5_215_000.0], [560_000.0, 5_215_000.0], [560_000.0, 5_214_900.0]
-    ]]})  # fmt: skip
-    features = [{"type": "Feature", "properties": {"class": 4 + n % 2}, "geometry": corners} for n in range(500)]
-    (tmp_path / "t.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    summary = build_map(tmp_path / "m.zarr", name="m", height=height, terrain=tmp_path / "t.geojson")
-    (overlap,) = [of for of in summary.findings if of.code == "polygons-overlap"]
-    assert overlap.numbers["overlap_m2"] > 1e6

@@ -13,7 +13,6 @@ from rasterio import Affine
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.tables.findings import Subject
 
 WORLD = World("EPSG:32633", 560_000.0, 5_215_000.0, side_m=40.0)
 TO_LONLAT = pyproj.Transformer.from_crs(WORLD.crs, "EPSG:4326", always_xy=True)
@@ -95,15 +94,6 @@ def test_numbers_are_values_of_the_table_first_and_ids_else(tmp_path, height):
     _, found = build(tmp_path, height, path, classes=tmp_path / "c.csv")
     wanted = drawn((FIELD, 2), (PUDDLE, 1), (ROAD, 1))
     np.testing.assert_array_equal(found, wanted)
-
-
-def test_a_national_map_says_how_well_its_datum_is_known(tmp_path, height):
-    path = collection(tmp_path, feature(FIELD, **{"class": "mud"}))
-    summary = build_map(tmp_path / "n.zarr", name="n", height=height, terrain=path, crs="EPSG:31256")
-    shifts = {of.subject: of.names for of in summary.findings if of.code == "datum-shift-rough"}
-    assert shifts[Subject("layer", "terrain")] == {"source": "WGS 84", "target": "MGI"}
-    source = open_map(tmp_path / "n.zarr")
-    assert source.read("terrain", 150, 151, 150, 151).tolist() == [[5]]
 
 
 def test_every_feature_without_a_class_of_the_table_is_named(tmp_path, height):
