@@ -456,5 +456,3 @@ def test_an_offset_of_a_role_that_is_not_there_is_an_error_and_a_placement_a_war
     found = read(other, tmp_path, parse_recipe(merged(topics, placed), where="").read)
     (unused_key,) = select_findings(found.report.findings, "recipe-key-unused")
     assert unused_key.names == {"key": "read.extrinsics.gnss"}
-
-

@@ -18,13 +18,12 @@ import pyarrow.parquet as pq
 import pytest
 import rasterio
 from installed_command import COMMAND, HANGS_S, plain_lines, run_script, tcpipe, told
-from mcap.reader import make_reader
-from mcap.writer import Writer
 from stored_files import checksums, map_path, only_run, tables
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.simulation import Faults, SimulatedSite, make_tiny, simulate
 from tcpipe.simulation.scenarios import RasterSpec
+from tcpipe.simulation.site_files import simulate_messages
 from tcpipe.store import Store, open_store
 
 _SECONDS = (32.0, 17.0, 17.0)
@@ -93,28 +92,6 @@ def _written(directory: Path) -> dict[Path, int]:
     """When each file was written, but for the history, which has every call."""
     files = (path for path in directory.rglob("*") if path.is_file() and path.parent.name != "calls")
     return {path: path.stat().st_mtime_ns for path in files}
-
-
-def _without_power(log: Path, out: Path) -> tuple[Path, Path]:
-    """Split a log in two by another library: power, and the rest."""
-    paths = out / "drive.mcap", out / "power.mcap"
-    with log.open("rb") as source, paths[0].open("wb") as rest, paths[1].open("wb") as power:
-        writers = [Writer(rest), Writer(power)]
-        channels: list[dict[int, int]] = [{}, {}]
-        for writer in writers:
-            writer.start(profile="ros2")
-        for schema, channel, message in make_reader(source).iter_messages():
-            here = int("power" in channel.topic)
-            if channel.id not in channels[here]:
-                schema_id = writers[here].register_schema(schema.name, schema.encoding, schema.data)
-                channels[here][channel.id] = writers[here].register_channel(
-                    channel.topic, channel.message_encoding, schema_id
-                )
-            number = channels[here][channel.id]
-            writers[here].add_message(number, message.log_time, message.data, message.publish_time)
-        for writer in writers:
-            writer.finish()
-    return paths
 
 
 # --- bad input ------------------------------------------------------------------------------------------------------
@@ -294,8 +271,11 @@ def test_one_recording_is_one_run_under_any_name(log: Path, tmp_path: Path) -> N
     assert len(Store(tmp_path / "tcpipe-store").runs()) == 1
 
 
-def test_power_logged_apart_is_one_drive(log: Path, store: Path, tmp_path: Path) -> None:
-    drive, power = _without_power(log, tmp_path)
+def test_power_logged_apart_is_one_drive(store: Path, tmp_path: Path) -> None:
+    drive, power = tmp_path / "drive.mcap", tmp_path / "power.mcap"
+    _, messages = simulate_messages(make_tiny(Faults(), seconds=_SECONDS[0]), seed=0)
+    write_mcap(drive, [stream for stream in messages if "power" not in stream.topic])
+    write_mcap(power, [stream for stream in messages if "power" in stream.topic])
     for paths in itertools.permutations((drive, power)):
         _run("ingest", *paths, "--as-one", "--store", "joined", cwd=tmp_path)
     found = [

@@ -1,6 +1,5 @@
 """Class tables as CSV and TOML."""
 
-
 import numpy as np
 import pytest
 import rasterio
@@ -113,5 +112,3 @@ def test_a_map_that_is_mostly_empty_is_made_of_what_it_has(tmp_path):
     summary = build_map(tmp_path / "m.zarr", name="m", height=path)
     assert summary.covered["height"] == 100 / 5000**2
     assert len(list((tmp_path / "m.zarr/height/c").rglob("*/*"))) == 1
-
-
