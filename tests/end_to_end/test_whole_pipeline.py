@@ -18,7 +18,6 @@ from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.geometry.rotation import rpy_from_quat, wrap_to_pi
 from tcpipe.simulation import Truth, compute_true_cost, read_truth
 from tcpipe.store import Store
-from tcpipe.tables.bits import DropReason
 
 DRAWS_DATASET_PAGES = True
 
@@ -148,28 +147,6 @@ def test_labels_know_their_own_error(drives: Drives) -> None:
         normalized = np.abs(error) / np.sqrt(total**2 - common**2)
         assert 0.60 <= np.mean(normalized < 1) <= 0.85, quantity
         assert 0.92 <= np.mean(normalized < 2) <= 0.995, quantity
-
-
-def test_steadily_driven_metres_become_segments(drives: Drives) -> None:
-    """Steady by the truth: full command for 2 s, forward, not turning hard."""
-    for run, truth in drives:
-        full = truth.command_velocity_mps >= 0.95
-        settled = np.convolve(full, np.ones(400), "full")[: len(full)] >= 400  # 2 s at 200 Hz
-        radius_m = np.abs(truth.forward_velocity_mps) / np.maximum(np.abs(truth.angular_velocity_radps[:, 2]), 1e-9)
-        steady = settled & (truth.wheel_velocity_mps > 0.2) & (truth.forward_velocity_mps > 0.3) & (radius_m > 1.5)
-        steady_m = np.diff(truth.distance_m, prepend=0.0)[steady].sum()
-        assert run.manifest.distance_by_reason_m["kept"] >= 0.90 * steady_m
-
-
-def test_no_dropped_row_inside_a_segment(drives: Drives) -> None:
-    for run, _ in drives:
-        track, segments = run.track().table, run.segments()
-        stamps, dropped = _column(track, "stamp_ns"), _column(track, "dropped_by")
-        count = np.concatenate([[0], np.cumsum(dropped != 0)])
-        first = np.searchsorted(stamps, _column(segments, "start_ns"), side="left")
-        last = np.searchsorted(stamps, _column(segments, "end_ns"), side="right")
-        assert (count[last] - count[first]).max() == 0
-        assert {int(bit) for bit in DropReason} >= set(np.unique(dropped & -dropped).tolist()) - {0}
 
 
 def test_demo_runs_everything_and_says_what_to_open(demo: Demo) -> None:

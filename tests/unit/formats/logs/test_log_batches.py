@@ -60,13 +60,3 @@ def test_rows_swapped_nearby_are_sorted_and_rows_far_behind_are_counted(tmp_path
     assert sum(part.num_rows for part in parts) == len(messages)
     assert (finding.code, finding.severity) == ("messages-unordered", "note")
     assert finding.numbers["places_count"] == 10
-
-
-def test_a_topic_of_few_messages_is_not_cut_into_crumbs(tmp_path):
-    images = random_messages(3, count=400, types=("sensor_msgs/msg/Imu",))
-    rare = random_messages(4, count=40, types=("std_msgs/msg/ColorRGBA",))
-    messages = sorted([*images, *rare], key=lambda message: message.log_time_ns)
-    with open_log(write_mcap(tmp_path / "a.mcap", messages, chunk_bytes=2048)) as log:
-        pieces = list(log.batches(log.topics, batch_bytes=30_000))
-    assert sum("/Imu" in piece for piece in pieces) > 4
-    assert [piece["/ColorRGBA"].num_rows for piece in pieces if "/ColorRGBA" in piece] == [40]
