@@ -41,21 +41,15 @@ def test_slopes_confirm_a_sound_run(drive, tmp_path):
 
 
 def test_a_wrong_unit_is_not_usable_until_the_printed_line_corrects_it(drive, tmp_path):
-    result, found = ingest_drive(scale(drive, "power", 0.1, "measured_currents"), tmp_path)
+    wrong = scale(drive, "power", 10.0, "measured_currents")
+    result, found = ingest_drive(wrong, tmp_path / "wrong")
     assert result.verdict.energy == "not usable"
     assert result.verdict.confirmed_by["energy"] == ("nothing",)
     assert found[CODE].names["witness"] == "slope"
-    corrected, found = ingest_drive(drive, tmp_path, recipe_that_follows(found[CODE]))
-    assert CODE not in found
+    corrected, left = ingest_drive(wrong, tmp_path / "right", recipe_that_follows(found[CODE]))
+    assert CODE not in left
+    assert corrected.verdict.energy == "usable"
     assert corrected.verdict.confirmed_by["energy"] == ("slope",)
-
-
-def test_the_printed_line_gives_the_right_energy(drive, tmp_path):
-    _, found = ingest_drive(scale(drive, "power", 10.0, "measured_currents"), tmp_path / "wrong")
-    result, _ = ingest_drive(
-        scale(drive, "power", 10.0, "measured_currents"), tmp_path / "right", recipe_that_follows(found[CODE])
-    )
-    assert result.verdict.energy == "usable"
     assert energy_ratio(drive, tmp_path / "right" / "store") == pytest.approx(1.0, abs=0.02)
 
 

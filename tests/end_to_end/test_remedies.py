@@ -15,10 +15,7 @@ MIN_COVERAGE = 0.8
 """Share of true labels inside 2σ below which a label is wrong."""
 
 
-FAULTS = (
-    "imu_late", "gyroscope_mirrored", "wheels_too_fast", "axes_swapped", "fixes_jump", "currents_in_milliamperes",
-    "power_slow",
-)  # fmt: skip
+FAULTS = ("imu_late", "gyroscope_mirrored", "wheels_too_fast", "fixes_jump", "currents_in_milliamperes")
 """Faults whose printed lines test_bad_sensors.py and test_power_sensor.py do not follow."""
 
 
