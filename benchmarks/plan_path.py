@@ -125,8 +125,9 @@ def search(survey: LazyCostGrid, class_id: NDArray[np.uint8], ends: list[int]) -
         survey.costs, survey.costs.per_metre("energy"), survey.costs.reasons == 0, survey.frames.metres(np.array(ends))
     )
     turning = find_turning(FIT, survey.source.classes)
-    paths = find_least_cost_paths(steps, find_best_potential(steps), *ends, turning, class_id)
-    return paths[0].reduced_cost if paths else np.inf
+    k = find_best_potential(steps)
+    paths = find_least_cost_paths(steps, k, *ends, turning, class_id)
+    return paths[0].cost - k * float(np.subtract(*steps.height_m.flat[ends[::-1]])) if paths else np.inf
 
 
 def measure(kind: str, cells: int, pairs: int) -> tuple[list[float], float, float]:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.atomic import Location, check_input_path, check_local_output, make_unique_name
+from tcpipe.formats.atomic import Location, check_input, check_local_output, make_unique_name
 from tcpipe.formats.documents import (
     BLOBS,
     KINDS,
@@ -206,7 +206,7 @@ def is_path(name: Location) -> bool:
     if is_url(name):
         return True
     with suppress(UsageError):
-        check_input_path(name)
+        check_input(name)
         return True
     return False
 

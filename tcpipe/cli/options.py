@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import MISSING, fields
-from functools import wraps
+from functools import partial, wraps
 from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -120,15 +120,16 @@ complete_runs = _complete_names(lambda context: _list_runs(store) if (store := _
 complete_maps = _complete_names(lambda context: store.scan().maps if (store := _store(context)) else ())
 """Offers the store's maps."""
 
-OUTPUT_DIRECTORY = Place(atomic.check_output_directory, written=True)
-OUTPUT_FILE = Place(atomic.check_output_file, written=True)
-INPUT_FILE = Place(atomic.check_input_file)
-INPUT_DIRECTORY = Place(atomic.check_input_directory)
-SEALED = Place(atomic.check_input_directory, urls=True)
+OUTPUT_DIRECTORY = Place(atomic.check_output, written=True)
+OUTPUT_FILE = Place(partial(atomic.check_output, wanted="file"), written=True)
+INPUT_FILE = Place(partial(atomic.check_input, wanted="file"))
+_check_directory = partial(atomic.check_input, wanted="directory")
+INPUT_DIRECTORY = Place(_check_directory)
+SEALED = Place(_check_directory, urls=True)
 """A dataset, a model or a store, here or in a bucket."""
-PUBLISHED = Place(atomic.check_output_directory, written=True, urls=True)
+PUBLISHED = Place(atomic.check_output, written=True, urls=True)
 """Where a dataset, a model or a store is written, here or in a bucket."""
-LOG = Place(atomic.check_input_path, urls=True)
+LOG = Place(atomic.check_input, urls=True)
 """A log, here or in object storage."""
 ONE_OF_SEVERAL = Place(str)
 """A log or raster, by pattern or address; the command checks each one and reports all problems at once."""

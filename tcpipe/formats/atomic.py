@@ -371,42 +371,24 @@ def check_local_output(path: Location) -> Path:
     return Path(path)
 
 
-def check_output_directory(path: Location) -> Path:
-    """Return where a directory is written; `UsageError` if a file or a URL is in the way."""
-    return _check_output(path, "file", "is a file, expected a directory; give another")
-
-
-def check_output_file(path: Location) -> Path:
-    """Return where a file is written; `UsageError` if a directory or a URL is in the way."""
-    return _check_output(path, "directory", "is a directory, expected the name of a file")
-
-
-def _check_output(path: Location, wrong: str, problem: str) -> Path:
+def check_output(path: Location, wanted: str = "directory") -> Path:
+    """Return where a directory or a file is written; `UsageError` if the other of them, or a URL, is in the way."""
     place = check_local_output(path)
-    if _find_kind(place) == wrong:
-        raise UsageError(f"{path}: {problem}")
+    if _find_kind(place) not in (None, wanted):
+        problem = (
+            "file, expected a directory; give another"
+            if wanted == "directory"
+            else "directory, expected the name of a file"
+        )
+        raise UsageError(f"{path}: is a {problem}")
     above = next((parent for parent in place.absolute().parents if _find_kind(parent)), None)
     if above is not None and _find_kind(above) == "file":
         raise UsageError(f"{place}: {above} is a file, expected a directory")
     return place
 
 
-def check_input_path(path: Location) -> Path:
-    """Return a file or directory that is there; `UsageError` else."""
-    return _check_input(path, "file or directory")
-
-
-def check_input_file(path: Location) -> Path:
-    """Return a file that is there; `UsageError` else."""
-    return _check_input(path, "file")
-
-
-def check_input_directory(path: Location) -> Path:
-    """Return a directory that is there; `UsageError` else."""
-    return _check_input(path, "directory")
-
-
-def _check_input(path: Location, wanted: str) -> Path:
+def check_input(path: Location, wanted: str = "file or directory") -> Path:
+    """Return a file or directory that is there; `UsageError` else, or where it is not as wanted."""
     kind = _find_kind(Path(path))
     if kind is None:
         why = "; it is read from this machine only" if _LIKE_A_URL.match(str(path)) else ""

@@ -72,12 +72,10 @@ class GridSteps(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LeastCostPath:
-    """A least-cost path: flat indices of its cells, its cost, its cost without the grade, and the potential a metre that takes it out."""
+    """A least-cost path: flat indices of its cells, and its cost."""
 
     cells: Ints
     cost: float
-    reduced_cost: float
-    potential: float
     negative_steps: int
     """Steps that gain more energy than their height explains; they cost nothing."""
 
@@ -301,8 +299,7 @@ def find_least_cost_paths(  # noqa: PLR0917
         labels, arrived = np.zeros(COURSES * to_goal.size), np.zeros(COURSES * to_goal.size, np.int8)
         last = _find_turning(steps, k, joule_per_rad, classes, _TURNS_RAD, to_goal, start, goal, labels, arrived)
         cells, raw, reduced = _trace_back(last, arrived, steps, k)
-        cost = float(labels[last])
-        paths.append(LeastCostPath(cells, cost - reduced + raw, cost, k, negative))
+        paths.append(LeastCostPath(cells, float(labels[last]) - reduced + raw, negative))
     return tuple(paths)
 
 

@@ -110,12 +110,11 @@ def _select_one_robot(store: Store, runs: list[StoredRun], robot: str | None) ->
 
 def _refuse_unlike(store: Store, runs: Iterable[StoredRun]) -> None:
     """Raise an error if runs of the generic robot have different sensors."""
-    groups = group_similar_runs({run.run_id: run.facts.sensors for run in runs})
-    if len(groups) > 1:
+    if differences := find_other_sensors({run.run_id: run.facts.sensors for run in runs}):
         raise DatasetError(
             f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; expected one: tag each "
             "(tcpipe ingest LOG --tag robot=NAME) and choose it with --tag robot=NAME, or pool them with --robot generic",
-            *(f"{list_first(sorted(names), 3)}: {format_robot(sensors)}" for names, sensors in groups),
+            *differences,
         )
 
 
@@ -175,54 +174,37 @@ def find_gone_runs(
     return tuple(make_finding("run-gone", Subject("run", run_id)) for run_id in sorted(gone))
 
 
-SensorsByRole = dict[str, tuple[str, str, str]]
-"""By role: topic, type and frame of a sensor."""
+def find_other_sensors(sensors: Mapping[str, Mapping[str, Sensor]]) -> list[str]:
+    """Return a line for each difference between runs, whose sensors are by role: another type, frame or namespace, or no role in common.
 
-
-def group_similar_runs(
-    sensors: Mapping[str, Mapping[str, Sensor]],
-) -> list[tuple[list[str], SensorsByRole]]:
-    """Return groups of runs whose sensors, by run and role, agree in type, frame and namespace, and the sensors of each group.
-
-    A run belongs to the first group with which it shares a role and differs in none: a sensor may be off for a drive.
+    A role that a run lacks is no difference: a sensor may be off for a drive.
     """
-    groups: list[tuple[list[str], SensorsByRole]] = []
-    sensors_by_run = {
-        run_id: {role: (sensor.topic, sensor.type_name, sensor.frame_id.strip("/")) for role, sensor in own.items()}
-        for run_id, own in sensors.items()
-    }
-    for run_id, own_sensors in sorted(sensors_by_run.items(), key=lambda item: (-len(item[1]), item[0])):
-        for runs, group_sensors in groups:
-            shared = own_sensors.keys() & group_sensors.keys()
-            if all(_is_similar(own_sensors[role], group_sensors[role]) for role in shared) and (
-                shared or not (own_sensors or group_sensors)
-            ):
-                runs.append(run_id)
-                group_sensors.update(
-                    {role: sensor for role, sensor in own_sensors.items() if role not in group_sensors}
-                )
-                break
+    known, differences = dict[str, Sensor](), dict[str, list[str]]()
+    for run_id in sorted(sensors, key=lambda run_id: (-len(sensors[run_id]), run_id)):
+        own = sensors[run_id]
+        shared = sorted(known.keys() & own.keys())
+        wrong = [role for role in shared if not _is_similar(known[role], own[role])] if shared else [*known, *own]
+        if wrong and known:
+            text = " instead of ".join(_format_sensors(each, dict.fromkeys(wrong)) for each in (own, known))
+            differences.setdefault(text, []).append(run_id)
         else:
-            groups.append(([run_id], own_sensors))
-    return groups
+            known = {**own, **known}
+    return [f"{list_first(sorted(run_ids), 3)}: {text}" for text, run_ids in differences.items()]
 
 
-def format_robot(sensors: SensorsByRole) -> str:
-    """Return the sensors of a robot as one line."""
-    parts = (
-        f"{role} {topic} ({kind}, frame {frame or 'none'})" for role, (topic, kind, frame) in sorted(sensors.items())
-    )
-    return ", ".join(parts) or "no sensor is known"
+def _format_sensors(sensors: Mapping[str, Sensor], roles: Iterable[str]) -> str:
+    """Return the sensors of some roles as text."""
+    known = ((role, sensors[role]) for role in roles if role in sensors)
+    parts = (f"{role} {each.topic} ({each.type_name}, frame {each.frame_id or 'none'})" for role, each in known)
+    return ", ".join(parts) or "no sensor"
 
 
-def _is_similar(one: tuple[str, str, str], other: tuple[str, str, str]) -> bool:
-    return one[1:] == other[1:] and not _is_in_two_namespaces(one[0], other[0])
-
-
-def _is_in_two_namespaces(one: str, other: str) -> bool:
-    """Return whether two topics differ only in their namespace, as /imu, /rover1/imu and /rover2/imu."""
-    a, b = one.strip("/").split("/"), other.strip("/").split("/")
-    return a != b and (a[1:] == b or a == b[1:] or (a[1:] == b[1:] and len(a) > 1))
+def _is_similar(one: Sensor, other: Sensor) -> bool:
+    """Return whether two sensors agree in type and frame, and not only their namespaces differ, as of /imu, /a/imu and /b/imu."""
+    a, b = one.topic.strip("/").split("/"), other.topic.strip("/").split("/")
+    is_apart = a != b and (a[1:] == b or a == b[1:] or (a[1:] == b[1:] and len(a) > 1))
+    kinds = ((each.type_name, each.frame_id.strip("/")) for each in (one, other))
+    return not is_apart and len(set(kinds)) == 1
 
 
 _LACKS = {"energy": "power", "slip": "wheel odometry", "vibration": "an IMU of 50 Hz or more"}

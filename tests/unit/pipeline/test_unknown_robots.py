@@ -7,7 +7,7 @@ from synthetic_store import add_run, lanes, open_world, segments, tag_run
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.dataset.runs import group_similar_runs
+from tcpipe.pipeline.dataset.runs import find_other_sensors
 from tcpipe.tables.levels import Sensor
 
 
@@ -19,23 +19,23 @@ ROVER = {"imu": sensor("/imu/data"), "gnss": sensor("/fix", "sensor_msgs/msg/Nav
 
 
 @pytest.mark.parametrize(
-    ("other", "groups"),
+    ("other", "is_same"),
     [
-        (ROVER, 1),
-        ({"imu": ROVER["imu"]}, 1),  # the GNSS receiver was off
-        ({"imu": sensor("/imu/raw", frame="/imu_link")}, 1),
-        ({"imu": sensor("/imu/data", frame="base_imu"), "gnss": ROVER["gnss"]}, 2),
-        ({**ROVER, "gnss": sensor("/fix", "nmea_msgs/msg/Sentence", "gps")}, 2),
-        ({"imu": sensor("/two/imu/data"), "gnss": sensor("/two/fix", "sensor_msgs/msg/NavSatFix", "gps")}, 2),
-        ({"imu": sensor("/two/imu/data")}, 2),
-        ({"wheel_odometry": sensor("/odom", "nav_msgs/msg/Odometry", "odom")}, 2),  # nothing tells
-        ({}, 2),
+        (ROVER, True),
+        ({"imu": ROVER["imu"]}, True),  # the GNSS receiver was off
+        ({"imu": sensor("/imu/raw", frame="/imu_link")}, True),
+        ({"imu": sensor("/imu/data", frame="base_imu"), "gnss": ROVER["gnss"]}, False),
+        ({**ROVER, "gnss": sensor("/fix", "nmea_msgs/msg/Sentence", "gps")}, False),
+        ({"imu": sensor("/two/imu/data"), "gnss": sensor("/two/fix", "sensor_msgs/msg/NavSatFix", "gps")}, False),
+        ({"imu": sensor("/two/imu/data")}, False),
+        ({"wheel_odometry": sensor("/odom", "nav_msgs/msg/Odometry", "odom")}, False),  # nothing tells
+        ({}, False),
     ],
 )
-def test_what_is_one_robot(other, groups):
-    found = group_similar_runs({"a": ROVER, "b": other, "c": ROVER})
-    assert len(found) == groups
-    assert sorted(run for runs, _ in found for run in runs) == ["a", "b", "c"]
+def test_what_is_one_robot(other, is_same):
+    found = find_other_sensors({"a": ROVER, "b": other, "c": ROVER})
+    assert (not found) == is_same
+    assert all(line.startswith("b: ") for line in found)
 
 
 @pytest.fixture
@@ -56,8 +56,7 @@ def test_what_differs_is_refused_and_what_settles_it_does(store, tmp_path):
     assert "not all of one robot: their sensors differ" in head
     assert "--tag robot=NAME, or pool them with --robot generic" in head
     assert groups == [
-        "a, c: gnss /fix (sensor_msgs/msg/NavSatFix, frame gps), imu /imu/data (sensor_msgs/msg/Imu, frame imu_link)",
-        "b: imu /imu/data (sensor_msgs/msg/Imu, frame base_imu)",
+        "b: imu /imu/data (sensor_msgs/msg/Imu, frame base_imu) instead of imu /imu/data (sensor_msgs/msg/Imu, frame imu_link)"
     ]
     build_dataset(tmp_path / "one", store=store.root, tag={"robot": "other"})
     build_dataset(tmp_path / "all", store=store.root, robot="generic")
