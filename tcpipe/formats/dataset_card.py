@@ -12,7 +12,7 @@ from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.formats.maps.map_facts import Description, MapInputs
 from tcpipe.recipe import Recipe
 from tcpipe.tables.facts import EnergyBudget, Floor, HeldOut, PhysicsFit
-from tcpipe.tables.findings import LEFT_OUT, Finding, Verdict, judge_by_code
+from tcpipe.tables.findings import Finding, Verdict, judge_by_code, omit
 from tcpipe.tables.levels import LABELS
 from tcpipe.terrain.layers import TerrainClass
 
@@ -29,7 +29,7 @@ class RunInputs:
     """Checksum of its log."""
     segments_sha256: str | None
     tags: Mapping[str, str]
-    message_definitions: str = field(default="", metadata={"json": ("",)})
+    message_definitions: str = omit("")
     """Hash of the definitions that were given for types which the log does not define."""
 
 
@@ -130,7 +130,7 @@ class LabelColumns:
 
     columns: tuple[str, str]
     velocity: str
-    includes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
+    includes: tuple[str, ...] = omit(())
     """Loads besides the drives in the power of any run."""
 
 
@@ -170,7 +170,7 @@ class RunSource:
     segments_sha256: str | None = None
     driven_m: float | None = None
     tags: Mapping[str, str] | None = None
-    findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
+    findings: tuple[Finding, ...] = omit(())
     """Findings of its ingest."""
     energy_budget: EnergyBudget | None = None
     samples: int = 0
@@ -215,7 +215,7 @@ class MapRegistration:
     height_scale_std: float | None = None
     expected_misfit_m: float | None = None
     """Misfit by the track's own height errors and the map's resolution [m]."""
-    applied_std_m: float | None = field(default=None, metadata=LEFT_OUT)
+    applied_std_m: float | None = omit()
     """DRMS of the shift, where the run's positions were moved by it."""
 
 
@@ -247,11 +247,11 @@ class MapSource:
     height_min_m: float | None = None
     height_max_m: float | None = None
     class_share: Mapping[str, float] | None = None
-    class_shares: Mapping[str, Mapping[str, float]] | None = field(default=None, metadata=LEFT_OUT)
+    class_shares: Mapping[str, Mapping[str, float]] | None = field(default=None, metadata={"json": (None, {})})
     """By layer, of a user's own categorical ones."""
     classes_from: str | None = None
     inputs: MapInputs | None = None
-    findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
+    findings: tuple[Finding, ...] = omit(())
     """Findings of building it."""
     registration: tuple[MapRegistration, ...] = ()
 
@@ -305,7 +305,7 @@ class DatasetCard:
     energy_budget: EnergyBudget | None = None
     labels: Mapping[str, int]
     """Samples that have each label (`tcpipe.tables.levels.LABELS`); 0: the label is absent."""
-    plane: str = field(default="", metadata={"json": ("",)})
+    plane: str = omit("")
     """Without a map: CRS of the plane in which footprints and regions are compared; `LOCAL` where runs have no GNSS."""
     split: SplitResult
     distance_by_reason_m: Mapping[str, float]
@@ -320,12 +320,12 @@ class DatasetCard:
     """Findings of the dataset itself: its choice of runs, sampling and splits. Runs and maps have their own."""
     verdict: Verdict
     """By all findings of the dataset, its maps and the runs that have samples."""
-    physics: Mapping[str, PhysicsFit] = field(default_factory=dict, metadata=LEFT_OUT)
+    physics: Mapping[str, PhysicsFit] = omit({})
     """By robot, the physics fitted on train: idle, drivetrain, rolling, grade and turning by class; robots without a fit are omitted."""
-    covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
-    added_columns: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
+    covariates: tuple[Covariate, ...] = omit(())
+    added_columns: Mapping[str, str] = omit({})
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
-    without_coordinates: bool = field(default=False, metadata={"json": (False,)})
+    without_coordinates: bool = omit(False)
     """Whether places are metres from an unpublished origin; then names, times, maps and regions are omitted too."""
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]

@@ -132,7 +132,7 @@ def _iterate_toml_lines(recipe: Recipe, definitions: Mapping[str, Any]) -> Itera
         )
 
 
-def _iterate_table_lines(head: str, here: Any, default: Any, definitions: Mapping[str, Any]) -> Iterator[str]:
+def _iterate_table_lines(head: str, here: Any, default: object, definitions: Mapping[str, Any]) -> Iterator[str]:
     """Yield a table of the recipe; one that it does not have is shown behind two #, since its keys alone would be another's."""
     cls: type = type(default)
     definition = definitions[cls.__name__]

@@ -16,12 +16,12 @@ from tcpipe.recipe import IngestSections
 from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFit, StageFacts
 from tcpipe.tables.findings import (
     AFFECTED,
-    LEFT_OUT,
     Finding,
     StageReport,
     Subject,
     Verdict,
     judge,
+    omit,
     select_findings,
     select_problems,
 )
@@ -54,7 +54,7 @@ class LogFailure:
     problems: tuple[str, ...]
     version: str
     """Version of tcpipe that failed."""
-    findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
+    findings: tuple[Finding, ...] = omit(())
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +64,8 @@ class Problem:
     finding: Finding
     content: str
     """The sha256 of the log, or what else identifies the subject: a problem of other content is a new one."""
-    log: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    run_id: str | None = field(default=None, metadata=LEFT_OUT)
+    log: tuple[str, ...] = omit(())
+    run_id: str | None = omit()
 
     @property
     def key(self) -> str:
@@ -196,7 +196,7 @@ class LogOrigin:
     size_bytes: int = 0
     sha256_of: Literal["log", "index"] = "log"
     """Data that was hashed: the whole log, or, if only part of it was downloaded, the sizes and indexes of its files."""
-    outline: str = field(default="", metadata=LEFT_OUT)
+    outline: str = ""
     """Hash of the size and index of the log, by which it is known where not all of it is at hand; "" where it has none."""
 
 
@@ -214,8 +214,8 @@ class Counts:
     """Numbers of segments, rows and rejected measurements of a run, and of messages."""
 
     segments: int
-    track_rows: int | None = field(default=None, metadata=LEFT_OUT)
-    rejections: int | None = field(default=None, metadata=LEFT_OUT)
+    track_rows: int | None = omit()
+    rejections: int | None = omit()
     messages: Mapping[str, int] = field(default_factory=dict)
     """By role."""
 
@@ -281,9 +281,9 @@ class RunFacts:
     """Folder of its streams: its own, or that of a run of the same log with the same streams."""
     streams: Mapping[str, Checksum]
     """``streams/<role>.parquet`` in that folder."""
-    tags: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
+    tags: Mapping[str, str] = omit({})
     """Tags of its log, read from the records of tags; not written to the manifest."""
-    superseded_by: str | None = field(default=None, metadata=LEFT_OUT)
+    superseded_by: str | None = omit()
     """The run with a longer recording: found when a store is scanned, no part of the manifest."""
 
     @property

@@ -51,7 +51,6 @@ from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, LOCAL_PLACES, PLACES, are_near, compute_middles
 from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.facts import ABSENT
 from tcpipe.tables.findings import (
     PREDICTED,
     Affected,
@@ -62,6 +61,7 @@ from tcpipe.tables.findings import (
     Verdict,
     judge,
     make_finding,
+    omit,
     read_threshold,
 )
 from tcpipe.terrain.layers import NODATA_ID
@@ -141,7 +141,7 @@ class SplitErrors:
     path_error_percent: Mapping[str, float]
     """Error of the sums of `PATH_M` m of a run, by quantity (T, E)."""
     label_floor: ErrorsByClass
-    leakage: Leakage | None = field(default=None, metadata=ABSENT)
+    leakage: Leakage | None = omit()
     """Nearness to training; None without training samples or places."""
 
 

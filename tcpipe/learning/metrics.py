@@ -14,7 +14,7 @@ taken as normal with its standard deviation s, z = (label - m) / s, by ::
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
 from tcpipe.arrays import Floats, Ints, Mask
-from tcpipe.tables.facts import ABSENT
+from tcpipe.tables.findings import omit
 
 QUANTITIES = ("w", "v", "T", "E")
 UNITS = {"w": "W", "v": "m/s", "T": "s", "E": "J"}
@@ -48,11 +48,11 @@ class Errors:
     mape_percent: float | None
     mape_count: int
     """Samples whose label is large enough for a percentage."""
-    coverage_percent: float | None = field(default=None, metadata=ABSENT)
+    coverage_percent: float | None = omit()
     """Coverage of 90 % intervals [%]; None, as the next two, without stated deviations."""
-    nll: float | None = field(default=None, metadata=ABSENT)
+    nll: float | None = omit()
     """Mean negative log-likelihood, of labels in their unit."""
-    crps: float | None = field(default=None, metadata=ABSENT)
+    crps: float | None = omit()
     """Mean continuous ranked probability score, in the label's unit."""
 
 

@@ -17,7 +17,8 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.maps.map_facts import Description, read_layers
 from tcpipe.learning.fitting import FitConfig, ModelKind
 from tcpipe.learning.predictor import Inputs
-from tcpipe.tables.facts import LEFT_OUT, PhysicsFit
+from tcpipe.tables.facts import PhysicsFit
+from tcpipe.tables.findings import omit
 from tcpipe.terrain.layers import PAPER_LAYERS, ClassTable, TerrainClass, make_paper_layers
 
 KIND = "tcpipe model"
@@ -61,7 +62,7 @@ class TrainingRange:
     """Class ids of which any pixel occurs."""
     ranges: Mapping[str, tuple[float, float]]
     """Smallest and largest ``slope_rad``, ``cross_slope_rad``, ``relief_m`` (highest above lowest pixel of a patch)."""
-    layers: Mapping[str, LayerRange] = field(default_factory=dict, metadata=LEFT_OUT)
+    layers: Mapping[str, LayerRange] = omit({})
     """Ranges of the user's layers that the model uses."""
 
 
@@ -101,7 +102,7 @@ class ModelCard:
     kind: str = KIND
     schema_version: int = SCHEMA_VERSION
     inputs: Inputs
-    layers: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
+    layers: Mapping[str, Description] = omit({})
     """Descriptions of channels that are not the paper's, from its dataset."""
     chord_m: float
     """d: T = d / v."""
@@ -116,7 +117,7 @@ class ModelCard:
     robot: str
     classes: tuple[TerrainClass, ...]
     training_range: TrainingRange
-    physics: PhysicsFit | None = field(default=None, metadata=LEFT_OUT)
+    physics: PhysicsFit | None = omit()
     """Physics of the robot, by the dataset: the planner takes the cost of turns from it."""
     dataset: TrainedOn
     training: Training

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Literal
 
@@ -26,8 +26,8 @@ from tcpipe.robots import Profiles
 from tcpipe.stages.proposals import find_proposals
 from tcpipe.stages.read import decide_roles, find_read_config
 from tcpipe.tables.columns import to_integers
-from tcpipe.tables.facts import ABSENT, ClockStep
-from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
+from tcpipe.tables.facts import ClockStep
+from tcpipe.tables.findings import Finding, Subject, make_finding, omit, sort_findings
 
 _GAP_PERIODS, _GAP_NS = 3, 300_000_000
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
@@ -64,16 +64,16 @@ class InspectedTopic:
     role: str | None
     why: str | None
     """Why it is used as its role, or is not used."""
-    stamps: StampCounts | None = field(default=None, metadata=ABSENT)
-    wrong_stamps: int | None = field(default=None, metadata=ABSENT)
+    stamps: StampCounts | None = omit()
+    wrong_stamps: int | None = omit()
     """Stamps beside zero that were replaced."""
-    time: Literal["header", "log"] | None = field(default=None, metadata=ABSENT)
+    time: Literal["header", "log"] | None = omit()
     """Which stamps rule."""
-    time_why: str | None = field(default=None, metadata=ABSENT)
+    time_why: str | None = omit()
     header_minus_log_s: float | None = None
-    moved_s: tuple[float, ...] | None = field(default=None, metadata=ABSENT)
+    moved_s: tuple[float, ...] | None = omit()
     """Offsets added to its stamps to bring them to the clock of most topics, by clock epoch [s]."""
-    simulated_time: bool | None = field(default=None, metadata=ABSENT)
+    simulated_time: bool | None = omit()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,20 +82,20 @@ class InspectedLog:
 
     kind: Literal["log"] = "log"
     path: str
-    container: str | None = field(default=None, metadata=ABSENT)
-    size_bytes: int | None = field(default=None, metadata=ABSENT)
+    container: str | None = omit()
+    size_bytes: int | None = omit()
     start_ns: int | None = None
     duration_s: float | None = None
-    robot: str | None = field(default=None, metadata=ABSENT)
-    robot_why: str | None = field(default=None, metadata=ABSENT)
-    topics: tuple[InspectedTopic, ...] | None = field(default=None, metadata=ABSENT)
-    clock_steps: tuple[ClockStep, ...] | None = field(default=None, metadata=ABSENT)
+    robot: str | None = omit()
+    robot_why: str | None = omit()
+    topics: tuple[InspectedTopic, ...] | None = omit()
+    clock_steps: tuple[ClockStep, ...] | None = omit()
     problems: tuple[str, ...] = ()
     """Decisions that ingest needs, or why the log cannot be read."""
-    findings: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
-    damage: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
-    notes: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
-    recipe: str | None = field(default=None, metadata=ABSENT)
+    findings: tuple[Finding, ...] | None = omit()
+    damage: tuple[Finding, ...] | None = omit()
+    notes: tuple[Finding, ...] | None = omit()
+    recipe: str | None = omit()
     """Recipe of ``tcpipe init --from`` without the keys that the recipe has [TOML]."""
 
 

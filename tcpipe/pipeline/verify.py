@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
@@ -33,7 +33,7 @@ from tcpipe.formats.stored_runs import BLOB, find_unnamed, list_named_files, lis
 from tcpipe.pipeline.calls import list_open_calls
 from tcpipe.pipeline.problems import find_incomplete_runs
 from tcpipe.store import Store, find_named_runs, is_store
-from tcpipe.tables.facts import LEFT_OUT
+from tcpipe.tables.findings import omit
 from tcpipe.tables.levels import COORDINATES, DATA_MODEL_VERSION
 
 
@@ -75,7 +75,7 @@ class Verified:
     """``dataset``, ``run``, ``store``, ``map``, ``model`` or ``cost map``."""
     read: Mapping[str, int]
     problems: tuple[str, ...]
-    notes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
+    notes: tuple[str, ...] = omit(())
     """How to repair the problems."""
 
     def __str__(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,7 @@ from tcpipe.planning.search import Turning, compute_course_changes, find_turning
 from tcpipe.splits.audit import PLACES, compute_middles
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.tables.findings import LEFT_OUT
+from tcpipe.tables.findings import omit
 from tcpipe.terrain.projection import compute_area, make_metres_from_plane
 from tcpipe.terrain.sampling import PatchFrames, compute_footprints, count_corners_on, make_patch_frames
 from tcpipe.terrain.tiles import MapReader
@@ -48,7 +48,7 @@ class PathTotals:
     robot: str
     label_energy: str = "total"
     """Kind of energy: ``total`` or ``net``."""
-    adapted_by: str | None = field(default=None, metadata=LEFT_OUT)
+    adapted_by: str | None = omit()
     """Run that adapted the model."""
     length_m: float
     path_segments: int

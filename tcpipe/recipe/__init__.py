@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 from tcpipe.recipe.checking import parse_utc_ns, validate_fields
 from tcpipe.robots import NOMINAL_STD_FRACTION, TABLE_POWER, PlausibleSpeed, PowerSource, Robot, Share, Volt
 from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.facts import LEFT_OUT
+from tcpipe.tables.findings import omit
 
 Role = Literal["gnss", "gnss_velocity", "imu", "wheel_odometry", "visual_odometry", "power", "command", "pose"]
 MappedRole = Literal["gnss", "gnss_velocity", "imu", "wheel_odometry", "visual_odometry", "command", "pose"]
@@ -76,11 +76,11 @@ class ReadConfig(_Section):
     """Topics by role (gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, power, command, pose), if unclear."""
     ignore_topics: list[str] = field(default_factory=list)
     """Topics that are never used."""
-    fields: dict[MappedRole, dict[str, str]] = field(default_factory=dict, metadata=LEFT_OUT)
+    fields: dict[MappedRole, dict[str, str]] = omit({})
     """Fields of your own message types by role (gnss.latitude = "pvt.lat * 1e-7"); also list the topic in topics."""
-    pose_crs: str | None = field(default=None, metadata=LEFT_OUT)
+    pose_crs: str | None = omit()
     """Projected CRS of the pose's positions (EPSG:2949); default: a local frame, which cannot be placed on a map."""
-    pose_sources: list[MadeFrom] = field(default_factory=list, metadata=LEFT_OUT)
+    pose_sources: list[MadeFrom] = omit([])
     """Roles besides GNSS that the pose was computed from: not fused as well, because they would count twice."""
     namespace: str | None = None
     """For a log of several robots: use only topics below this name (for example "/husky_1"); default: all topics."""
@@ -88,21 +88,21 @@ class ReadConfig(_Section):
     """Sensor extrinsics by role; overrides /tf_static."""
     gnss_crs: str = "EPSG:4326"
     """Geographic CRS of the GNSS positions; RTK often comes in a national datum."""
-    fix_std_m: dict[FixQuality, Deviation] = field(default_factory=dict, metadata=LEFT_OUT)
+    fix_std_m: dict[FixQuality, Deviation] = omit({})
     """Horizontal σ of fixes without useful covariance [m]: rtk_fixed 0.02, rtk_float 0.5, differential 1, single 4."""
     time_source: dict[Role, Literal["auto", "header", "log"]] = field(default_factory=dict)
     """Source of stamps by role: header, log or auto; auto uses header.stamp if it is set and follows the log time."""
     time_offset_s: dict[Role, Offset] = field(default_factory=dict)
     """Offset added to the stamps of a role [s]."""
-    odometry_scale: dict[Role, Scale] = field(default_factory=dict, metadata=LEFT_OUT)
+    odometry_scale: dict[Role, Scale] = omit({})
     """Factor on velocities and distances of an odometry (wheels of another radius, a camera of another baseline)."""
     imu_units: Literal["si", "deg", "g", "deg_g"] = "si"
     """Units of the IMU: si: rad/s and m/s² (REP-103); deg: deg/s and m/s²; g: rad/s and g; deg_g: deg/s and g."""
-    current_scale: Annotated[float, Bounds(ge=1e-6, le=1e6)] = field(default=1.0, metadata={"json": (1.0,)})
+    current_scale: Annotated[float, Bounds(ge=1e-6, le=1e6)] = omit(1.0)
     """Factor on all currents, powers and counters of energy: 0.001 if a driver publishes milliamperes as amperes."""
     current_sign: Literal["auto", "drawn_positive", "drawn_negative"] = "auto"
     """Sign of currents: auto uses the message type's; for BatteryState, which differs by robot, the run's mean."""
-    current_offset_amp: Annotated[float, Bounds(ge=-1e4, le=1e4)] = field(default=0.0, metadata={"json": (0.0,)})
+    current_offset_amp: Annotated[float, Bounds(ge=-1e4, le=1e4)] = omit(0.0)
     """Zero of each rail's current, positive as drawn, that is subtracted [A]; of a power without voltage [W]."""
     power_averaged: Literal["auto", "yes", "no"] = "auto"
     """Whether the power source averages over its message period: auto uses the value of the message type."""
@@ -124,9 +124,9 @@ class FuseConfig(_Section):
     """Lower bound of GNSS standard deviations, whatever the receiver reports [m]."""
     gnss_default_std_m: Deviation = 0.05
     """Horizontal σ where the receiver gives none (the paper's RTK: 5 cm); vertical is twice as large [m]."""
-    lever_arm_std_m: tuple[Tolerance, Tolerance, Tolerance] | None = field(default=None, metadata=LEFT_OUT)
+    lever_arm_std_m: tuple[Tolerance, Tolerance, Tolerance] | None = omit()
     """Standard deviation of the lever arm of GNSS antenna or pose [m]; 0: exact. Default: 0.05 horizontal, up 0.1."""
-    gnss_velocity_std_mps: Deviation = field(default=0.1, metadata={"json": (0.1,)})
+    gnss_velocity_std_mps: Deviation = omit(0.1)
     """σ of a receiver's own velocity if it gives none (NMEA never does) [m/s]; vertical is twice as large."""
     wheel_std_mps: Deviation = 0.05
     """Standard deviation of wheel velocity where the source gives none [m/s]."""
@@ -212,7 +212,7 @@ class MaskConfig(_Section):
     """See `require_full_speed`."""
     max_velocity_mps: Limit | None = None
     """Maximum speed of the robot; default: from the profile [m/s]."""
-    max_plausible_mps: PlausibleSpeed | None = field(default=None, metadata=LEFT_OUT)
+    max_plausible_mps: PlausibleSpeed | None = omit()
     """No labels where the track is faster; the run fails if most of a minute is. Default: from the profile [m/s]."""
     stationary_velocity_mps: Limit = 0.05
     """Slower than this (and not turning) is stationary [m/s]."""
@@ -230,9 +230,9 @@ class MaskConfig(_Section):
     """Keep sections driven backwards."""
     max_relative_position_std_m: Deviation = 0.10
     """A section is a gap where the standard deviation of the distance over one chord exceeds this [m]."""
-    max_position_std_m: Deviation | None = field(default=None, metadata=LEFT_OUT)
+    max_position_std_m: Deviation | None = omit()
     """Rows whose horizontal position has a larger standard deviation (DRMS) are masked; default: no limit [m]."""
-    windows: list[TimeWindow] = field(default_factory=list, metadata=LEFT_OUT)
+    windows: list[TimeWindow] = omit([])
     """Spans of runs that are kept or dropped, as {run = "farm_*", action = "drop", start = 0, end = 30}."""
 
 
@@ -258,9 +258,9 @@ class LabelConfig(_Section):
     """A segment more curved than this is flagged."""
     flag_position_std_m: Deviation = 0.10
     """A segment with an end whose absolute position is less certain than this is flagged weak_gnss [m]."""
-    power_gain_std_fraction: Fraction | None = field(default=None, metadata=LEFT_OUT)
+    power_gain_std_fraction: Fraction | None = omit()
     """σ of the power sensor's gain; default: from the power source."""
-    power_offset_std_amp: Annotated[float, Bounds(ge=0, le=1e4)] | None = field(default=None, metadata=LEFT_OUT)
+    power_offset_std_amp: Annotated[float, Bounds(ge=0, le=1e4)] | None = omit()
     """σ of the zero of each rail's current; default: from the power source and the current at rest [A]."""
 
 
@@ -371,23 +371,21 @@ class TableMapping:
     """Column by field (latitude, linear_x, …: docs/how-to/tables.md), or an expression, as "(velL + velR) / 2"."""
     units: dict[str, str] = field(default_factory=dict)
     """Units by field: "km/h", "mV", …; default: from the column's name, else deg, m, m/s, rad/s, m/s2, V, A, W, J."""
-    nominal_voltage_volt: Volt | None = field(default=None, metadata=LEFT_OUT)
+    nominal_voltage_volt: Volt | None = omit()
     """Assumed voltage of a current [V]."""
-    nominal_voltage_std_fraction: Share = field(
-        default=NOMINAL_STD_FRACTION, metadata={"json": (NOMINAL_STD_FRACTION,)}
-    )
+    nominal_voltage_std_fraction: Share = omit(NOMINAL_STD_FRACTION)
     """Its σ, as a fraction: one error of a run."""
     stamp: str | None = None
     """Column of the stamps; default: the first."""
     stamp_unit: Literal["auto", "s", "ms", "us", "ns", "ms_today"] = "auto"
     """Unit of numeric stamps; auto infers it from their size (from 1970) or name. ms_today counts from midnight."""
-    stamp_format: str = field(default="", metadata={"json": ("",)})
+    stamp_format: str = omit("")
     """Format of stamps that are text, as "%d.%m.%Y %H:%M:%S%.f"; "": one of the usual."""
-    stamp_zone: str = field(default="", metadata={"json": ("",)})
+    stamp_zone: str = omit("")
     """Time zone of stamps without one, as "Europe/Vienna" or "UTC"; also of the tables that state none."""
-    stamp_date: str = field(default="", metadata={"json": ("",)})
+    stamp_date: str = omit("")
     """Date of times of day: a column, or as "2025-07-09"; "": of the file's name, else its last change, with a note."""
-    stamp_utc: str = field(default="", metadata={"json": ("",)})
+    stamp_utc: str = omit("")
     """Column of UTC, also in whole seconds: the stamps of a faster clock are shifted onto it by one constant."""
     offset_s: Offset = 0.0
     """Added to the stamps [s]."""
@@ -419,9 +417,9 @@ class IngestSections:
     mask: MaskConfig
     segment: SegmentConfig
     label: LabelConfig
-    robots: dict[str, Robot] = field(default_factory=dict, metadata=LEFT_OUT)
-    power_sources: list[PowerSource] = field(default_factory=list, metadata=LEFT_OUT)
-    tables: dict[str, TableMapping] = field(default_factory=dict, metadata=LEFT_OUT)
+    robots: dict[str, Robot] = omit({})
+    power_sources: list[PowerSource] = omit([])
+    tables: dict[str, TableMapping] = omit({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -439,12 +437,12 @@ class Recipe:
     split: SplitConfig = field(default_factory=SplitConfig)
     covariates: CovariateConfig = field(default_factory=CovariateConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    train: TrainConfig = field(default_factory=TrainConfig, metadata=LEFT_OUT)
-    robots: dict[str, Robot] = field(default_factory=dict, metadata=LEFT_OUT)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    robots: dict[str, Robot] = omit({})
     """Your own robot profiles by name; a profile with a built-in name replaces the built-in one."""
-    power_sources: list[PowerSource] = field(default_factory=list, metadata=LEFT_OUT)
+    power_sources: list[PowerSource] = omit([])
     """Power sources of your own message types, one table per rail; they replace the built-in ones of the same type."""
-    tables: dict[str, TableMapping] = field(default_factory=dict, metadata=LEFT_OUT)
+    tables: dict[str, TableMapping] = omit({})
     """Tables of a log that is a folder of CSV, text or Parquet files, by role or by any name."""
 
     def __post_init__(self) -> None:

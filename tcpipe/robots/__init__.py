@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.findings import LEFT_OUT
+from tcpipe.tables.findings import omit
 
 Size = Annotated[float, Bounds(ge=0.05, le=100)]
 """Size of a robot [m]: from a toy's to a mining truck's."""
@@ -91,7 +91,7 @@ class Robot:
     """Length of its footprint [m]."""
     max_velocity_mps: Speed | None = None
     """Maximum speed [m/s]; below this command the terrain does not limit the speed."""
-    max_plausible_mps: PlausibleSpeed = field(default=MAX_PLAUSIBLE_MPS, metadata={"json": (MAX_PLAUSIBLE_MPS,)})
+    max_plausible_mps: PlausibleSpeed = omit(MAX_PLAUSIBLE_MPS)
     """Largest plausible speed of a track [m/s]; faster rows get no label."""
     voltage_range_volt: tuple[Volt, Volt] | None = None
     """Lowest and highest voltage of the battery [V]; segments outside are flagged."""
@@ -130,9 +130,9 @@ class PowerSource:
     """Field of the current [A]; omit it if the message contains only a voltage, or a counter."""
     energy: str = ""
     """Field of a counter of energy, in place of a current, for example drawn - given_back."""
-    power: str = field(default="", metadata={"json": ("",)})
+    power: str = omit("")
     """Field of the power [W], in place of a current; needs no voltage."""
-    joints: str = field(default="", metadata={"json": ("",)})
+    joints: str = omit("")
     """Joints whose torque times speed is the power: a regular expression of whole names."""
     voltage_scale: Scale = 1.0
     """Factor on the voltage: 0.001 if it is in millivolts."""
@@ -140,19 +140,17 @@ class PowerSource:
     """Factor on the current or power: 0.001 if it is in milliamperes."""
     energy_scale: Scale = 1.0
     """Factor on the counter: 3600 if it counts watt-hours."""
-    torque_scale: Scale = field(default=1.0, metadata={"json": (1.0,)})
+    torque_scale: Scale = omit(1.0)
     """Factor on the efforts of joints, to N m."""
-    speed_scale: Scale = field(default=1.0, metadata={"json": (1.0,)})
+    speed_scale: Scale = omit(1.0)
     """Factor on the velocities of joints, to rad/s."""
-    loss_watt_per_nm2: Annotated[float, Bounds(ge=0, le=1e6)] = field(default=0.0, metadata={"json": (0.0,)})
+    loss_watt_per_nm2: Annotated[float, Bounds(ge=0, le=1e6)] = omit(0.0)
     """Loss of each joint per squared torque: motor resistance / torque constant², at the joint."""
-    recovered: bool = field(default=False, metadata={"json": (False,)})
+    recovered: bool = omit(False)
     """Whether negative power of a joint counts."""
-    nominal_voltage_volt: Volt | None = field(default=None, metadata=LEFT_OUT)
+    nominal_voltage_volt: Volt | None = omit()
     """Assumed voltage of a current [V]."""
-    nominal_voltage_std_fraction: Share = field(
-        default=NOMINAL_STD_FRACTION, metadata={"json": (NOMINAL_STD_FRACTION,)}
-    )
+    nominal_voltage_std_fraction: Share = omit(NOMINAL_STD_FRACTION)
     """Its σ, as a fraction: one error of a run."""
     counter_wraps: Annotated[float, Bounds(gt=0, le=1e19)] | None = None
     """Value at which the counter wraps to zero, in its own unit; if omitted, a decrease is a reset."""
@@ -166,17 +164,13 @@ class PowerSource:
     """Sign of a drawn current; auto if it differs by robot: the mean over the run decides."""
     propulsion: bool = True
     """Whether the current feeds only the drives; such sources have priority."""
-    gain_std_fraction: Share | None = field(default=None, metadata=LEFT_OUT)
+    gain_std_fraction: Share | None = omit()
     """σ of the sensor's gain, one error of a whole run; default: 0.02, of torques 0.1."""
-    offset_std_amp: Annotated[float, Bounds(ge=0, le=1e4)] = field(
-        default=OFFSET_STD_AMP, metadata={"json": (OFFSET_STD_AMP,)}
-    )
+    offset_std_amp: Annotated[float, Bounds(ge=0, le=1e4)] = omit(OFFSET_STD_AMP)
     """σ of the zero of the current, likewise [A]."""
-    offset_std_watt: Annotated[float, Bounds(ge=0, le=1e6)] = field(
-        default=OFFSET_STD_WATT, metadata={"json": (OFFSET_STD_WATT,)}
-    )
+    offset_std_watt: Annotated[float, Bounds(ge=0, le=1e6)] = omit(OFFSET_STD_WATT)
     """The same of a power without voltage [W]."""
-    rest_current_amp: tuple[Amp, Amp] | None = field(default=None, metadata=LEFT_OUT)
+    rest_current_amp: tuple[Amp, Amp] | None = omit()
     """Lowest and highest current of the stationary robot, if known; beyond is an offset [A]."""
     other_loads: str = ""
     """Other loads of the current; named in a warning."""

@@ -13,7 +13,7 @@ import numpy as np
 from tcpipe.arrays import Floats
 from tcpipe.compiled import compile_kernel
 from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED, World
-from tcpipe.tables.facts import ABSENT
+from tcpipe.tables.findings import omit
 
 GRAVITY_MPS2 = 9.80665
 _STEEPEST_SIN = float(np.sin(np.radians(22.5)))
@@ -77,7 +77,7 @@ class SimulatedRobot:
     resistance_noise_s: float = 0.15  # its correlation time
     ground: dict[int, GroundModel] = field(default_factory=lambda: dict(_GROUND))
     """By class id; a class that is not named is grass."""
-    wheels: Wheels | None = field(default=None, metadata=ABSENT)
+    wheels: Wheels | None = omit()
     """None: the ground under the robot's middle counts, and its bumps and slope across cost nothing."""
 
     def ground_table(self) -> Floats:

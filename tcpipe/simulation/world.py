@@ -16,7 +16,7 @@ from pyproj import Transformer
 from scipy.special import erf
 
 from tcpipe.arrays import Bytes, Floats, Mask
-from tcpipe.tables.facts import ABSENT
+from tcpipe.tables.findings import omit
 
 _SEMI_MAJOR_M = 6378137.0
 _ECCENTRICITY2 = 0.0066943799901413165
@@ -299,9 +299,9 @@ class World:
     texture: tuple[Wave, ...] = ()  # ripples of the brightness, as a fraction
     resistance: tuple[Wave, ...] = field(default=())
     """Ripples of the rolling resistance that no map shows, as a fraction."""
-    surface: Surface | None = field(default=None, metadata=ABSENT)
+    surface: Surface | None = omit()
     """Variation of the ground of a class from metre to metre; None: everywhere the same."""
-    sun: tuple[float, float, float] | None = field(default=None, metadata=ABSENT)
+    sun: tuple[float, float, float] | None = omit()
     """Unit vector east, north, up to the sun that the orthophoto was taken in; None: under an even sky."""
 
     def height_m(self, x_map_m: Floats, y_map_m: Floats) -> Floats:

@@ -8,11 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from tcpipe.tables.findings import LEFT_OUT as LEFT_OUT  # noqa: PLC0414  facts are documents, too
-from tcpipe.tables.findings import StageReport
-
-ABSENT: Mapping[str, tuple[object, ...]] = {"json": (None,)}
-"""Metadata of a field that JSON omits if it is None."""
+from tcpipe.tables.findings import StageReport, omit
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,17 +55,17 @@ class PowerSign:
 
     current_sign: str
     averaged: bool
-    includes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    gain_std_fraction: float | None = field(default=None, metadata=LEFT_OUT)
-    offset_std_amp: float | None = field(default=None, metadata=LEFT_OUT)
-    rest_current_amp: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
-    zero_amp: float = field(default=0.0, metadata={"json": (0.0,)})
-    charging: bool = field(default=False, metadata={"json": (False,)})
-    charge_ratio: float | None = field(default=None, metadata=LEFT_OUT)
+    includes: tuple[str, ...] = omit(())
+    gain_std_fraction: float | None = omit()
+    offset_std_amp: float | None = omit()
+    rest_current_amp: tuple[float, float] | None = omit()
+    zero_amp: float = omit(0.0)
+    charging: bool = omit(False)
+    charge_ratio: float | None = omit()
     """Integral of the current over the fall of the battery's charge."""
-    meter_slope: float | None = field(default=None, metadata=LEFT_OUT)
+    meter_slope: float | None = omit()
     """Slope of a second meter's power over the power."""
-    side_share: float | None = field(default=None, metadata=LEFT_OUT)
+    side_share: float | None = omit()
     """Share of one side in the current in straight driving; 0.5 where both sides draw the same."""
 
 
@@ -124,11 +120,11 @@ class StretchFacts:
     nis_mean: Mapping[str, float | None]
     measurements: Mapping[str, int]
     rejected: Mapping[str, int]
-    gate_resets: tuple[GateReset, ...] = field(default=(), metadata=LEFT_OUT)
-    common_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
+    gate_resets: tuple[GateReset, ...] = omit(())
+    common_scale_std: float | None = omit()
     """σ of the unobservable common odometry scale, included in σ of distances, speeds and labels."""
-    changes: tuple[ChangeFacts, ...] = field(default=(), metadata=LEFT_OUT)
-    parameters: Mapping[str, ParameterFacts] = field(default_factory=dict, metadata=LEFT_OUT)
+    changes: tuple[ChangeFacts, ...] = omit(())
+    parameters: Mapping[str, ParameterFacts] = omit({})
     clock_epoch: int = 0
     start_ns: int = 0
     end_ns: int = 0
@@ -261,7 +257,7 @@ class EnergyBudget:
     """The total with power at 20 Hz."""
     common: float
     """The error that all segments of a run share, which is not part of the total."""
-    delay: float | None = field(default=None, metadata=LEFT_OUT)
+    delay: float | None = omit()
     """The error by the delay of power against motion, which is not part of the total."""
 
 
@@ -348,7 +344,7 @@ class PhysicsFacts:
     """Idle power and physics model of a run (`tcpipe.cost.physics`); None where they cannot be determined."""
 
     idle_watt: float | None
-    fit: PhysicsFit | None = field(default=None, metadata=LEFT_OUT)
+    fit: PhysicsFit | None = omit()
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,13 +382,13 @@ class PowerSensorFacts:
 
     gain_std_fraction: float
     offset_std_amp: float
-    rest_amp: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
-    battery_ohm: float | None = field(default=None, metadata=LEFT_OUT)
-    gain_ratio: float | None = field(default=None, metadata=LEFT_OUT)
-    gain_changed_ns: int | None = field(default=None, metadata=LEFT_OUT)
+    rest_amp: tuple[float, float] | None = omit()
+    battery_ohm: float | None = omit()
+    gain_ratio: float | None = omit()
+    gain_changed_ns: int | None = omit()
     lost_signs: int = 0
-    smoothing: Smoothing | None = field(default=None, metadata=LEFT_OUT)
-    delay_s: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+    smoothing: Smoothing | None = omit()
+    delay_s: tuple[float, float] | None = omit()
 
     @property
     def unsettled_s(self) -> tuple[float, float]:
@@ -419,7 +415,7 @@ class LabelFacts:
     energy_budget: EnergyBudget | None
     quality: Mapping[str, int]
     physics: PhysicsFacts
-    power_sensor: PowerSensorFacts | None = field(default=None, metadata=LEFT_OUT)
+    power_sensor: PowerSensorFacts | None = omit()
 
 
 @dataclass(frozen=True, slots=True)
@@ -434,16 +430,16 @@ class StageFacts:
     clock_steps: tuple[ClockStep, ...] = ()
     time_offset_s: Mapping[str, float] = field(default_factory=dict)
     """Correction of a role's stamps by the recipe."""
-    odometry_scale: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
+    odometry_scale: Mapping[str, float] | None = field(default=None, metadata={"json": (None, {})})
     """Factor of a role's distances and velocities in the recipe."""
-    power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
-    fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
-    sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
-    clock_offsets: tuple[ClockFacts, ...] = field(default=(), metadata=LEFT_OUT)
+    power: PowerSign | None = omit()
+    fuse: FuseFacts | None = omit()
+    sensor_checks: SensorChecks | None = omit()
+    clock_offsets: tuple[ClockFacts, ...] = omit(())
     """Time offsets between the sensors of each section, in order of clock epoch and time."""
-    mask: MaskFacts | None = field(default=None, metadata=LEFT_OUT)
-    segment: SegmentFacts | None = field(default=None, metadata=LEFT_OUT)
-    label: LabelFacts | None = field(default=None, metadata=LEFT_OUT)
+    mask: MaskFacts | None = omit()
+    segment: SegmentFacts | None = omit()
+    label: LabelFacts | None = omit()
 
 
 NOTHING_FOUND = StageReport((), StageFacts())

@@ -122,8 +122,13 @@ SubjectKind: TypeAlias = Literal[
     "call", "model", "robot", "split", "label",
 ]  # fmt: skip
 
-LEFT_OUT: Mapping[str, tuple[object, ...]] = {"json": (None, {}, [], ())}
-"""Metadata of a field which, while it is None or empty, is no key of the JSON object."""
+
+def omit(default: object = None) -> Any:
+    """Return a field with a default that is no key of the JSON object while it has its default; a collection, while it is empty."""
+    omitted = (None, {}, [], ()) if default in ({}, [], ()) else (default,)
+    if isinstance(default, dict | list):
+        return field(default_factory=type(default), metadata={"json": omitted})
+    return field(default=default, metadata={"json": omitted})
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,9 +145,9 @@ class Remedy:
 
     name: str
     """Key in the catalogue's ``remedies`` of the finding's code."""
-    recipe: Mapping[str, Any] = field(default_factory=dict, metadata=LEFT_OUT)
+    recipe: Mapping[str, Any] = omit({})
     """Keys by the dotted name of their table; an array of tables as a list."""
-    command: str | None = field(default=None, metadata=LEFT_OUT)
+    command: str | None = omit()
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,10 +166,10 @@ class Finding:
     severity: Severity
     subject: Subject
     action: Action
-    span_s: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
-    numbers: Mapping[str, float] = field(default_factory=dict, metadata=LEFT_OUT)
-    names: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
-    remedies: tuple[Remedy, ...] = field(default=(), metadata=LEFT_OUT)
+    span_s: tuple[float, float] | None = omit()
+    numbers: Mapping[str, float] = omit({})
+    names: Mapping[str, str] = omit({})
+    remedies: tuple[Remedy, ...] = omit(())
 
     def __hash__(self) -> int:
         """Return a hash that differs from run to run: of ten thousand runs one by code alone would collide."""

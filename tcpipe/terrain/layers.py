@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Bytes, Floats, Floats32, Mask
-from tcpipe.tables.facts import LEFT_OUT
 
 NODATA_ID = 0
 """The id of pixels without a class."""
@@ -41,7 +40,7 @@ class TerrainClass:
     id: int
     name: str
     traversable: bool
-    color: str | None = field(default=None, compare=False, repr=False, metadata=LEFT_OUT)
+    color: str | None = field(default=None, compare=False, repr=False, metadata={"json": (None,)})
     """Colour on pages, ``#rrggbb``; None: by its name."""
 
 

@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 from xml.etree.ElementTree import Element, fromstring
 
 from tcpipe.formats.json_files import parse_typed, to_plain
-from tcpipe.tables.findings import LEFT_OUT, Finding
+from tcpipe.tables.findings import Finding, omit
 from tcpipe.terrain.layers import (
     PAPER_LAYERS,
     ClassTable,
@@ -28,8 +28,8 @@ class MapInputs:
 
     files: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     crs: str | None = None
-    categorical: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    ortho_bands: str | None = field(default=None, metadata=LEFT_OUT)
+    categorical: tuple[str, ...] = omit(())
+    ortho_bands: str | None = omit()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +44,7 @@ class MapFacts:
     height_max_m: float
     class_share: Mapping[str, float]
     """Share of each terrain class among the pixels that have a class."""
-    class_shares: Mapping[str, Mapping[str, float]] = field(default_factory=dict, metadata=LEFT_OUT)
+    class_shares: Mapping[str, Mapping[str, float]] = omit({})
     """The same of the user's own layers."""
     findings: tuple[Finding, ...] = ()
     classes_from: str
@@ -66,7 +66,7 @@ class MapSummary(MapFacts):
     layers: tuple[str, ...]
     overviews: tuple[int, ...]
     class_table: tuple[TerrainClass, ...]
-    described: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
+    described: Mapping[str, Description] = omit({})
     """Descriptions of layers other than the paper's."""
 
 

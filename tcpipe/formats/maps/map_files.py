@@ -24,7 +24,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,7 @@ from tcpipe.formats.zarr_arrays import (
     create_group,
     open_sharded,
 )
-from tcpipe.tables.facts import LEFT_OUT
+from tcpipe.tables.findings import omit
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.layers import PAPER_LAYERS, ClassScheme, ClassTable, Layer, Pixels, TerrainClass, find_no_data_value
 from tcpipe.terrain.resampling import iterate_levels, list_factors, make_overview_grid
@@ -75,7 +75,7 @@ class _Attributes:
     class_table: tuple[TerrainClass, ...]
     id_by_value: Mapping[int, int]
     layers: tuple[str, ...]
-    described: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
+    described: Mapping[str, Description] = omit({})
     factors: tuple[int, ...]
     tile_px: int
     height_reference_m: float
