@@ -12,8 +12,9 @@ from tcpipe.cli.options import add_path_or_run, json_option, msgdef_option, reci
 from tcpipe.cli.output import NEXT_STEP, print_json, print_line, print_lines, resolve_recipe_with_source
 
 if TYPE_CHECKING:
+    from tcpipe.formats.dataset_card import InspectedDataset
+    from tcpipe.formats.maps.map_facts import InspectedMap
     from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
-    from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
     from tcpipe.pipeline.log_inspection import InspectedLog, InspectedTopic
     from tcpipe.tables.findings import Finding
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from typing import Literal
 
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
@@ -360,6 +361,14 @@ class DatasetCard:
     def findings_by_map(self) -> dict[str, tuple[Finding, ...]]:
         """Findings of building each map."""
         return {source.name: source.findings for source in self.maps}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectedDataset(DatasetCard):
+    """Card of a dataset, as `tcpipe inspect` prints it."""
+
+    kind: Literal["dataset"] = "dataset"
+    path: str
 
 
 def judge_dataset(findings: Iterable[Finding], runs: Iterable[RunSource], maps: Iterable[MapSource]) -> Verdict:

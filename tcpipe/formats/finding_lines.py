@@ -144,9 +144,9 @@ def _build_recipe_fragment(remedy: Remedy) -> RecipeFragment:
     return RecipeFragment(remedy.recipe, is_checked=True)
 
 
-def format_findings(findings: Iterable[Finding], *, most: int = MOST_LINES, more: str = "") -> list[str]:
-    """Return at most ``most`` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
-    return format_groups(_make_single_groups(findings), most=most, more=more)
+def format_findings(findings: Iterable[Finding], *, more: str = "") -> list[str]:
+    """Return at most `MOST_LINES` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
+    return format_groups(_make_single_groups(findings), more=more)
 
 
 def list_findings(findings: Iterable[Finding]) -> list[str]:
@@ -158,9 +158,9 @@ def _make_single_groups(findings: Iterable[Finding]) -> list[tuple[FindingGroup[
     return [(FindingGroup(each.code, {each.subject.name: (each,)}), None, "") for each in sort_findings(findings)]
 
 
-def format_verdict(verdict: Verdict, quantities: Sequence[Affected] = AFFECTED) -> str:
+def format_verdict(verdict: Verdict) -> str:
     """Return the grades as one line, the worst first: ``energy not usable; position and time usable with care``."""
-    labels = {grade: [name for name in quantities if getattr(verdict, name) == grade] for grade in reversed(GRADES)}
+    labels = {grade: [name for name in AFFECTED if getattr(verdict, name) == grade] for grade in reversed(GRADES)}
     return "; ".join(f"{_join(names)} {grade}" for grade, names in labels.items() if names)
 
 
@@ -300,18 +300,16 @@ def _format_range(findings: Sequence[Finding]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def format_groups(
-    groups: Iterable[tuple[FindingGroup[K], int | None, str]], *, most: int = MOST_LINES, more: str = ""
-) -> list[str]:
-    """Return at most ``most`` groups as lines, each with the arguments of `format_group`, the worst first.
+def format_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]], *, more: str = "") -> list[str]:
+    """Return at most `MOST_LINES` groups as lines, each with the arguments of `format_group`, the worst first.
 
     The last line states how many others and notes are listed by the command ``more``.
     """
     printed = _sort_printed(groups)
     problems = [group for group in printed if group[0].severity != "note"]
-    counted = ((max(len(problems) - most, 0), "more finding"), (len(printed) - len(problems), "note"))
+    counted = ((max(len(problems) - MOST_LINES, 0), "more finding"), (len(printed) - len(problems), "note"))
     rest = " and ".join(f"{count} {what}{'' if count == 1 else 's'}" for count, what in counted if count)
-    return list_groups(problems[:most]) + ([f"and {rest}{f': {more}' if more else ''}"] if rest else [])
+    return list_groups(problems[:MOST_LINES]) + ([f"and {rest}{f': {more}' if more else ''}"] if rest else [])
 
 
 def _sort_printed(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.resources import files
@@ -101,56 +101,37 @@ def make_recipe_id(recipe: Recipe | Mapping[str, Json], robot: str) -> str:
     return digest({"ingest": ingest_key(recipe), "robot": robot})[:8]
 
 
-def format_commented_toml(recipe: Recipe | None = None) -> str:
-    """Return every key with its default and meaning as TOML; keys at their default are commented out."""
-    return "\n".join(_iterate_toml_lines(recipe or Recipe(), describe(Recipe)[1])) + "\n"
+def format_commented_toml() -> str:
+    """Return every key with its default and meaning as TOML, commented out."""
+    return "\n".join(_iterate_toml_lines(describe(Recipe)[1])) + "\n"
 
 
-def _iterate_toml_lines(recipe: Recipe, definitions: Mapping[str, Any]) -> Iterator[str]:
+def _iterate_toml_lines(definitions: Mapping[str, Any]) -> Iterator[str]:
     yield "# The recipe of tcpipe. Every key with its default, commented out; remove the # to change one."
     yield "# Names end in the unit. Reasons: docs/explanation/rulings.md"
     default = Recipe()
     names = f"one of {', '.join(sorted(load_shipped_profiles().robots))}, or of [robots]"
-    yield from _iterate_key_lines(
-        definitions["Recipe"]["properties"]["robot"], "robot", recipe.robot, default.robot, names
-    )
-    for section in fields(recipe):
-        here = getattr(recipe, section.name)
-        if not is_dataclass(here):
-            continue
-        yield from _iterate_table_lines(f"[{section.name}]", here, getattr(default, section.name), definitions)
-    robots: Mapping[str, Robot | None] = recipe.robots or {"NAME": None}
-    for name, robot in robots.items():
-        yield from _iterate_table_lines(f"[robots.{as_toml(name) if robot else name}]", robot, Robot(), definitions)
-    sources: Sequence[PowerSource | None] = recipe.power_sources or [None]
-    for source in sources:
-        yield from _iterate_table_lines("[[power_sources]]", source, PowerSource(""), definitions)
-    tables: Mapping[str, TableMapping | None] = recipe.tables or {"ROLE": None}
-    for name, table in tables.items():
-        yield from _iterate_table_lines(
-            f"[tables.{as_toml(name) if table else name}]", table, TableMapping(), definitions
-        )
+    yield from _iterate_key_lines(definitions["Recipe"]["properties"]["robot"], "robot", default.robot, names)
+    for section in fields(default):
+        if is_dataclass(values := getattr(default, section.name)):
+            yield from _iterate_table_lines(f"[{section.name}]", values, definitions)
+    others = {"[robots.NAME]": Robot(), "[[power_sources]]": PowerSource(""), "[tables.ROLE]": TableMapping()}
+    for head, values in others.items():  # behind two #, since its keys alone would be another table's
+        yield from _iterate_table_lines(f"## {head}", values, definitions, mark="#")
 
 
-def _iterate_table_lines(head: str, here: Any, default: object, definitions: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a table of the recipe; one that it does not have is shown behind two #, since its keys alone would be another's."""
-    cls: type = type(default)
-    definition = definitions[cls.__name__]
-    comments = (f"# {line}" for line in definition["description"].splitlines() if line)
-    yield from ("", *comments, head if here else f"## {head}")
-    for name, kind in read_annotations(cls).items():
-        value, usual = getattr(here or default, name), getattr(default, name)
-        for line in _iterate_key_lines(definition["properties"][name], name, value, usual, format_values(kind)):
-            yield line if here else f"#{line}"
+def _iterate_table_lines(head: str, values: object, definitions: Mapping[str, Any], *, mark: str = "") -> Iterator[str]:
+    definition = definitions[type(values).__name__]
+    yield from ("", *(f"# {line}" for line in definition["description"].splitlines() if line), head)
+    for name, kind in read_annotations(type(values)).items():
+        lines = _iterate_key_lines(definition["properties"][name], name, getattr(values, name), format_values(kind))
+        yield from (f"{mark}{line}" for line in lines)
 
 
-def _iterate_key_lines(schema: Mapping[str, Any], name: str, value: Any, usual: Any, choices: str) -> Iterator[str]:
+def _iterate_key_lines(schema: Mapping[str, Any], name: str, value: object, choices: str) -> Iterator[str]:
     yield f"# {schema.get('description', '')}"
     note = choices and f"  # {choices}"
-    if value is None:
-        yield f"# {name} ={note}"
-    else:
-        yield f"{'# ' if value == usual else ''}{name} = {as_toml(value)}{note}"
+    yield f"# {name} ={note}" if value is None else f"# {name} = {as_toml(value)}{note}"
 
 
 @cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zipfile
 import zlib
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -82,21 +82,15 @@ def _check_headers(stream: BinaryIO, size: int) -> None:
 _READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
-def check_arrays(
-    arrays: Mapping[str, NDArray[np.generic]], forms: Mapping[str, ArrayForm], optional: Collection[str] = ()
-) -> None:
-    """Raise `ModelError` unless arrays have these names, types and shapes; those that are ``optional`` may be missing."""
-    if wrong := _find_wrong_form(
-        {name: (array.dtype.name, array.shape) for name, array in arrays.items()}, forms, optional
-    ):
+def check_arrays(arrays: Mapping[str, NDArray[np.generic]], forms: Mapping[str, ArrayForm]) -> None:
+    """Raise `ModelError` unless arrays have these names, types and shapes."""
+    if wrong := _find_wrong_form({name: (array.dtype.name, array.shape) for name, array in arrays.items()}, forms):
         raise ModelError(f"contains the weights of another model: {wrong}; train the model again")
 
 
-def _find_wrong_form(
-    found: Mapping[str, ArrayForm], forms: Mapping[str, ArrayForm], optional: Collection[str]
-) -> str | None:
+def _find_wrong_form(found: Mapping[str, ArrayForm], forms: Mapping[str, ArrayForm]) -> str | None:
     """Return in words the first array that is not as it is wanted; None where all are."""
-    if missing := forms.keys() - found.keys() - set(optional):
+    if missing := forms.keys() - found.keys():
         return f"{min(missing)} is missing"
     lengths: dict[str, int] = {}
     for name, (dtype, shape) in found.items():

@@ -28,7 +28,8 @@ from tcpipe.tables.findings import AFFECTED, Finding, Grade, Verdict
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 if TYPE_CHECKING:
-    from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
+    from tcpipe.formats.dataset_card import InspectedDataset
+    from tcpipe.formats.maps.map_facts import InspectedMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,8 +138,8 @@ def inspect(
     if is_store(path):
         return _inspect_store(Store(path))
     if path.suffix == ".zarr":
+        from tcpipe.formats.maps.map_facts import InspectedMap  # noqa: PLC0415
         from tcpipe.formats.maps.map_files import open_map  # noqa: PLC0415  it takes longer to load than a log to inspect
-        from tcpipe.pipeline.inspected import InspectedMap  # noqa: PLC0415
 
         return convert_record(open_map(path).summary(), InspectedMap, path=str(path))
     return _inspect_logs_or_tables(path, recipe, ask)
@@ -161,8 +162,8 @@ def _inspect_url(url: str, ask: Callable[[Location], InspectedLog]) -> Inspected
 
 
 def _inspect_dataset(directory: Path, name: str) -> InspectedDataset:
+    from tcpipe.formats.dataset_card import InspectedDataset  # noqa: PLC0415
     from tcpipe.formats.dataset_files import read_intact_card  # noqa: PLC0415  as above
-    from tcpipe.pipeline.inspected import InspectedDataset  # noqa: PLC0415
 
     return convert_record(read_intact_card(directory), InspectedDataset, kind="dataset", path=name)
 

@@ -70,6 +70,14 @@ class MapSummary(MapFacts):
     """Descriptions of layers other than the paper's."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectedMap(MapSummary):
+    """Summary of a map, as `tcpipe inspect` prints it."""
+
+    kind: Literal["map"] = "map"
+    path: str
+
+
 _SHARES = 5
 """Classes that a line lists by their share, commonest first."""
 
