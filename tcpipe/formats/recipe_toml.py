@@ -128,7 +128,7 @@ def _iterate_table_lines(head: str, values: object, definitions: Mapping[str, An
         yield from (f"{mark}{line}" for line in lines)
 
 
-def _iterate_key_lines(schema: Mapping[str, Any], name: str, value: object, choices: str) -> Iterator[str]:
+def _iterate_key_lines(schema: Mapping[str, Any], name: str, value: Any, choices: str) -> Iterator[str]:
     yield f"# {schema.get('description', '')}"
     note = choices and f"  # {choices}"
     yield f"# {name} ={note}" if value is None else f"# {name} = {as_toml(value)}{note}"
