@@ -120,7 +120,7 @@ def _iterate_toml_lines(definitions: Mapping[str, Any]) -> Iterator[str]:
         yield from _iterate_table_lines(f"## {head}", values, definitions, mark="#")
 
 
-def _iterate_table_lines(head: str, values: object, definitions: Mapping[str, Any], *, mark: str = "") -> Iterator[str]:
+def _iterate_table_lines(head: str, values: Any, definitions: Mapping[str, Any], *, mark: str = "") -> Iterator[str]:
     definition = definitions[type(values).__name__]
     yield from ("", *(f"# {line}" for line in definition["description"].splitlines() if line), head)
     for name, kind in read_annotations(type(values)).items():
