@@ -38,47 +38,35 @@ class IngestOptions:
     recipe: Recipe | Location | None = option(None, RECIPE)
     robot: str | None = option(
         None,
-        Option(
-            "Robot profile, built in or from the recipe (default: found by message types and topic names).",
-            kind="robot",
-            metavar="NAME",
-        ),
+        "Robot profile, built in or from the recipe (default: found by message types and topic names).",
+        kind="robot",
+        metavar="NAME",
     )
     tag: Mapping[str, str] | None = tags("Tag for the runs; repeatable.")
     jobs: int = jobs("Logs")
     cluster: str | None = option(
         None,
-        Option(
-            "Dask scheduler whose workers ingest the logs, tcp://host:port (or TCPIPE_CLUSTER); instead of --jobs.",
-            metavar="ADDRESS",
-            envvar="TCPIPE_CLUSTER",
-        ),
+        "Dask scheduler whose workers ingest the logs, tcp://host:port (or TCPIPE_CLUSTER); instead of --jobs.",
+        metavar="ADDRESS",
+        envvar="TCPIPE_CLUSTER",
     )
     """Workers see logs and store under the same absolute paths."""
-    as_one: bool = option(False, Option("Treat all logs as parts of one drive (split logs; power in a separate log)."))
+    as_one: bool = option(False, "Treat all logs as parts of one drive (split logs; power in a separate log).")
     msgdef: Location | None = option(None, MESSAGE_DEFINITIONS)
     shard: tuple[int, int] | None = option(
-        None,
-        Option(
-            "Be task I of N of an array job: ingest its share of the logs, by their names.",
-            (),
-            "shard",
-            "I/N",
-        ),
+        None, "Be task I of N of an array job: ingest its share of the logs, by their names.", (), "shard", "I/N"
     )
     min_age: float = option(
         0.0,
-        Option(
-            "Skip logs that were changed more recently than this (90, 90s, 10m, 2h, 1d); a number is seconds.",
-            (),
-            "duration",
-            "T",
-            shown="0",
-        ),
+        "Skip logs that were changed more recently than this (90, 90s, 10m, 2h, 1d); a number is seconds.",
+        (),
+        "duration",
+        "T",
+        shown="0",
     )
-    retry_failed: bool = option(False, Option("Try logs again that failed before."))
-    existing_store: bool = option(False, Option("Fail if there is no store, so that an unmounted one is not replaced."))
-    force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
+    retry_failed: bool = option(False, "Try logs again that failed before.")
+    existing_store: bool = option(False, "Fail if there is no store, so that an unmounted one is not replaced.")
+    force: bool = option(False, "Ingest all logs again, also those that failed before.")
     on_found: Callable[[Mapping[str, int]], None] | None = None
     """Called once with the size [byte] of every log by its name."""
     on_result: Callable[[IngestResult], None] | None = None
@@ -108,35 +96,27 @@ class AddMapOptions:
     )
     """The property is a class name, value or id."""
     classes: Location | None = option(
-        None, Option("Class table: CSV with value,id,name,traversable, or TOML.", (), "input_file", "FILE")
+        None, "Class table: CSV with value,id,name,traversable, or TOML.", (), "input_file", "FILE"
     )
     """None takes the store's, else the paper's seven classes. The first map with terrain or classes sets the store's table."""
     layer: Mapping[str, Files] | None = option(
-        None,
-        Option(
-            "Another raster of one band, as layer NAME; repeatable.",
-            (),
-            "layers",
-            "NAME=FILE",
-        ),
+        None, "Another raster of one band, as layer NAME; repeatable.", (), "layers", "NAME=FILE"
     )
     categorical: Mapping[str, Location | None] | None = option(
         None,
-        Option(
-            "Layer NAME contains classes: named by FILE, like --classes, or by the raster itself.",
-            (),
-            "class_tables",
-            "NAME[=FILE]",
-        ),
+        "Layer NAME contains classes: named by FILE, like --classes, or by the raster itself.",
+        (),
+        "class_tables",
+        "NAME[=FILE]",
     )
     """None: as the raster names its values."""
     ortho_bands: Literal["grey", "rgb"] = option(
-        "grey", Option("rgb also keeps red, green and blue as layers.", (), ("grey", "rgb"))
+        "grey", "rgb also keeps red, green and blue as layers.", (), ("grey", "rgb")
     )
     crs: str | None = option(
-        None, Option("Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n")
+        None, "Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n"
     )
-    force: bool = option(False, Option("Replace a map of this name that has other inputs."))
+    force: bool = option(False, "Replace a map of this name that has other inputs.")
     store: Location = option("tcpipe-store", STORE)
 
 
@@ -144,63 +124,60 @@ class AddMapOptions:
 class BuildDatasetOptions:
     """Which runs and maps a dataset is made from, and how."""
 
-    out: Location = option("dataset", Option(kind="published", metavar="[OUT]", is_argument=True))
+    out: Location = option("dataset", kind="published", metavar="[OUT]", is_argument=True)
     """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a folder of its own."""
     _: KW_ONLY
     split: Location | None = option(
-        None, Option("GeoJSON region (WGS84): inside is train and test, outside is unseen.", (), "input_file", "FILE")
+        None, "GeoJSON region (WGS84): inside is train and test, outside is unseen.", (), "input_file", "FILE"
     )
     """None: everything is train and test."""
     map: str | Sequence[str] | None = option(
         None,
-        Option(
-            "Map to sample from (default: the only one in the store); repeatable; where maps overlap, the first has priority.",
-            (), "map", "NAME", repeatable=True
-        ),
-    )  # fmt: skip
-    robot: str | None = option(None, Option("Use only runs of this robot.", (), "robot", "NAME"))
+        "Map to sample from (default: the only one in the store); repeatable; where maps overlap, the first has priority.",
+        (),
+        "map",
+        "NAME",
+        repeatable=True,
+    )
+    robot: str | None = option(None, "Use only runs of this robot.", (), "robot", "NAME")
     tag: Mapping[str, str] | None = tags("Use only runs with this tag; if repeated, with all of the tags.")
     store: Location = option("tcpipe-store", STORE)
     recipe: Recipe | Location | None = option(None, RECIPE)
     jobs: int = jobs("Runs sampled")
-    format: FileFormat = option("zarr", Option("Format of the patches.", kind=("zarr", "parquet")))
+    format: FileFormat = option("zarr", "Format of the patches.", kind=("zarr", "parquet"))
     holdout: str | None = option(
         None,
-        Option(
-            "Unit that is held out for test: block, sample, run, or tag:NAME for values of a tag (default: from the recipe).",
-            (), "holdout", "HOW"
-        ),
-    )  # fmt: skip
+        "Unit that is held out for test: block, sample, run, or tag:NAME for values of a tag (default: from the recipe).",
+        (),
+        "holdout",
+        "HOW",
+    )
     covariates: Location | Sequence[Location] = option(
         (),
-        Option(
-            "Table (CSV or Parquet) that is joined to the samples by time, such as weather or soil; repeatable.",
-            (), "input_file", "FILE", repeatable=True
-        ),
-    )  # fmt: skip
-    seed: int | None = option(None, Option("Seed of split and row order (default: from the recipe).", (), SEED))
+        "Table (CSV or Parquet) that is joined to the samples by time, such as weather or soil; repeatable.",
+        (),
+        "input_file",
+        "FILE",
+        repeatable=True,
+    )
+    seed: int | None = option(None, "Seed of split and row order (default: from the recipe).", (), SEED)
     min_runs: int | None = option(
         None,
-        Option(
-            "Fail if fewer runs are usable; otherwise excluded and missing runs are notes.",
-            (), Range(1, 1_000_000), "N"
-        ),
-    )  # fmt: skip
+        "Fail if fewer runs are usable; otherwise excluded and missing runs are notes.",
+        (),
+        Range(1, 1_000_000),
+        "N",
+    )
     labels: str | Sequence[str] = option(
         (),
-        Option(
-            "Labels that every sample needs, with commas: energy, time, slip, vibration (default: energy if a run has power, else time).",
-            metavar="LIST"
-        ),
-    )  # fmt: skip
+        "Labels that every sample needs, with commas: energy, time, slip, vibration (default: energy if a run has power, else time).",
+        metavar="LIST",
+    )
     without_patches: bool = option(
-        False, Option("Write samples without patches; also without a map (default if the store has none).")
+        False, "Write samples without patches; also without a map (default if the store has none)."
     )
     without_coordinates: bool = option(
-        False,
-        Option("For publication: metres from an unstated origin, and no longitude, latitude, CRS, times or names."),
+        False, "For publication: metres from an unstated origin, and no longitude, latitude, CRS, times or names."
     )
-    force: bool = option(
-        False, Option("Replace a dataset that was made with other options (region, map, tags, recipe …).")
-    )
+    force: bool = option(False, "Replace a dataset that was made with other options (region, map, tags, recipe …).")
     dry_run: bool = option(False, DRY_RUN)

@@ -196,8 +196,6 @@ class PlannedLog:
     """Why the log is not tried again."""
     findings: tuple[Finding, ...] = ()
     """Findings on its problems."""
-    has_failed: bool = False
-    """Whether it failed before, under whatever conditions."""
 
     @property
     def is_todo(self) -> bool:
@@ -251,20 +249,14 @@ def _decide(task: IngestTask, known: _Known, now_ns: int) -> PlannedLog:  # noqa
     if source.name in known.passing:  # it was old enough then
         return PlannedLog(task, "failed_transient", _remove_name(known.passing[source.name], task))
     if check_age(task, now_ns):
-        return PlannedLog(task, "growing", has_failed=_describe_content(task) in known.failures)
+        return PlannedLog(task, "growing")
     if current is not None:
         return PlannedLog(
             task, *(("outdated", "its tags change") if is_there else ("pending", "the files of its run are missing"))
         )
     if made:
         return PlannedLog(task, "outdated", _describe_outdated(made[-1], task))
-    return PlannedLog(
-        task, "pending", _describe_pending(task, known), has_failed=_describe_content(task) in known.failures
-    )
-
-
-def _describe_content(task: IngestTask) -> str:
-    return task.source.sha256 or task.source.files_digest
+    return PlannedLog(task, "pending", _describe_pending(task, known))
 
 
 def _stand(task: IngestTask, made: RunFacts, known: _Known) -> PlannedLog:
@@ -285,7 +277,7 @@ def _stand(task: IngestTask, made: RunFacts, known: _Known) -> PlannedLog:
 
 def _describe_pending(task: IngestTask, known: _Known) -> str:
     """Return why a log that was seen before is to be ingested; "" of a new one."""
-    if before := known.failures.get(_describe_content(task)):
+    if before := known.failures.get(task.source.sha256 or task.source.files_digest):
         is_acknowledged = all(make_failure(each.content, each.log).key in known.acknowledged for each in before)
         return f"{_describe_failure(before, task)}{', acknowledged' if is_acknowledged else ''}; to be tried again"
     if task.force:

@@ -15,13 +15,12 @@ if TYPE_CHECKING:
 
 _ORIGIN = Option(
     "Origin of the map frame of Nav2, whose axes are true east and north (default: the plane of the map's CRS).",
-    (), "lonlat",
-)  # fmt: skip
+    (),
+    "lonlat",
+)
 
 
-_CELL_SIZE = Option(
-    "Side of a cell; plans on a cost map have its cells.", (), Range(0.05, 1000.0), "METRES"
-)  # fmt: skip
+_CELL_SIZE = Option("Side of a cell; plans on a cost map have its cells.", (), Range(0.05, 1000.0), "METRES")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +32,15 @@ class PredictPathOptions:
     _: KW_ONLY
     map: str | None = option(None, MAP)
     out: Location | None = option(
-        None, Option("Write the table of path segments: .csv or .geojson.", (), "output_file", "FILE")
+        None, "Write the table of path segments: .csv or .geojson.", (), "output_file", "FILE"
     )
     speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
     adapt: Location | None = option(
         None,
-        Option(
-            "Adapt MODEL by the labelled metres of a run, of this or another robot: an ingested log, by its path or its run's name.",
-            metavar="RUN",
-        ),
-    )  # fmt: skip
+        "Adapt MODEL by the labelled metres of a run, of this or another robot: an ingested log, by its path or its run's name.",
+        metavar="RUN",
+    )
     store: Location = option("tcpipe-store", STORE)
 
 
@@ -57,35 +54,27 @@ class PlanPathOptions:
     )
     goal: tuple[float, float] = required(Option("End of the path.", ("--to", "--goal"), "lonlat"))
     _: KW_ONLY
-    objective: Objective = option("energy", Option("Quantity to minimise.", (), ("energy", "time", "distance")))
+    objective: Objective = option("energy", "Quantity to minimise.", (), ("energy", "time", "distance"))
     map: str | None = option(None, MAP)
-    out: Location = option("plan.geojson", Option("Write the path as GeoJSON.", (), "output_file", "FILE"))
+    out: Location = option("plan.geojson", "Write the path as GeoJSON.", (), "output_file", "FILE")
     cost_map: Location | None = option(
         None,
-        Option(
-            "Cost map of this model and map; without one, the cells of all short paths are predicted.",
-            (),
-            "sealed",
-            "DIR",
-        ),
+        "Cost map of this model and map; without one, the cells of all short paths are predicted.",
+        (),
+        "sealed",
+        "DIR",
     )
     cell_size: float = option(1.0, _CELL_SIZE)
-    allow_extrapolation: bool = option(
-        False,
-        Option(
-            "Also cross ground outside the training range of the model."
-        ),
-    )  # fmt: skip
+    allow_extrapolation: bool = option(False, "Also cross ground outside the training range of the model.")
     risk: float | None = option(
         None,
-        Option(
-            "Minimise what the path does not exceed with this probability (default with --budget: 0.95).",
-            (), Range(0.5, 0.999), "PROBABILITY",
-        ),
-    )  # fmt: skip
+        "Minimise what the path does not exceed with this probability (default with --budget: 0.95).",
+        (),
+        Range(0.5, 0.999),
+        "PROBABILITY",
+    )
     budget: float | None = option(
-        None,
-        Option("Print the probability that this energy suffices: 300Wh, 500kJ.", (), "energy", "ENERGY"),
+        None, "Print the probability that this energy suffices: 300Wh, 500kJ.", (), "energy", "ENERGY"
     )
     origin: tuple[float, float] | None = option(None, _ORIGIN)
     speed: float | None = option(None, SPEED)
@@ -100,7 +89,7 @@ class CostMapOptions:
     """Options of a cost map: map, model and resolution."""
 
     model: str = required(MODEL)
-    out: str = option("cost-map", Option(kind="published", metavar="[OUT]", is_argument=True))
+    out: str = option("cost-map", kind="published", metavar="[OUT]", is_argument=True)
     _: KW_ONLY
     map: str | None = option(None, MAP)
     cell_size: float = option(1.0, _CELL_SIZE)
@@ -117,9 +106,9 @@ class RouteGraphOptions:
     model: str = required(MODEL)
     graph: str = required(Option("Graph (GeoJSON, metres).", (), "input_file", "FILE"))
     _: KW_ONLY
-    out: str = option("route-graph.geojson", Option("Write the graph.", (), "output_file", "FILE"))
+    out: str = option("route-graph.geojson", "Write the graph.", (), "output_file", "FILE")
     origin: tuple[float, float] | None = option(None, _ORIGIN)
-    two_way: bool = option(False, Option("Add an edge back for each that has none."))
+    two_way: bool = option(False, "Add an edge back for each that has none.")
     map: str | None = option(None, MAP)
     speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)

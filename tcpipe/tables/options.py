@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from inspect import cleandoc, signature
 from math import isfinite
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
 
 from tcpipe.errors import UsageError
 
@@ -28,6 +28,10 @@ class Range(NamedTuple):
     """Whether the least is excluded."""
 
 
+Kind: TypeAlias = Range | tuple[str, ...] | str
+"""Bounds of a number, the choices, or the name of one of `tcpipe.cli.options.KINDS`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Option:
     """How the command line shows a field."""
@@ -35,8 +39,7 @@ class Option:
     about: str = ""
     flags: tuple[str, ...] = ()
     """In place of ``--`` and the field's name."""
-    kind: Range | tuple[str, ...] | str = ""
-    """Bounds of a number, the choices, or the name of one of `tcpipe.cli.options.KINDS`."""
+    kind: Kind = ""
     metavar: str | None = None
     shown: str | float | None = None
     """The default as the command line shows it, where the field's own is None or another type."""
@@ -71,19 +74,27 @@ def required(shown: Option) -> Any:
     return field(metadata={"option": shown})
 
 
-def option(default: object, shown: Option) -> Any:
-    """Return a field with its default."""
-    return field(default=default, metadata={"option": shown})
+def option(
+    default: object,
+    shown: Option | str = "",
+    flags: tuple[str, ...] = (),
+    kind: Kind = "",
+    metavar: str | None = None,
+    **more: Any,
+) -> Any:
+    """Return a field with its default and its `Option`, or the fields of that."""
+    declared = shown if isinstance(shown, Option) else Option(shown, flags, kind, metavar, **more)
+    return field(default=default, metadata={"option": declared})
 
 
 def jobs(what: str) -> Any:
     """Return the field of ``--jobs``."""
-    return option(1, Option(f"{what} side by side.", ("--jobs", "-j"), Range(1, 1024)))
+    return option(1, f"{what} side by side.", ("--jobs", "-j"), Range(1, 1024))
 
 
 def tags(about: str) -> Any:
     """Return the field of ``--tag``."""
-    return option(None, Option(about, (), "tags", "K=V"))
+    return option(None, about, (), "tags", "K=V")
 
 
 def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R]:
@@ -122,7 +133,7 @@ def _check_bounds(options: Any, function: str) -> None:
         raise UsageError(*problems)
 
 
-def _describe_mismatch(kind: Range | tuple[str, ...] | str, value: Any) -> str:
+def _describe_mismatch(kind: Kind, value: Any) -> str:
     """Return what an option is to be, "" where it is that."""
     if isinstance(kind, Range):
         is_inside = (
