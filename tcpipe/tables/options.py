@@ -76,14 +76,14 @@ def required(shown: Option) -> Any:
 
 def option(
     default: object,
-    shown: Option | str = "",
+    about: Option | str = "",
     flags: tuple[str, ...] = (),
     kind: Kind = "",
     metavar: str | None = None,
     **more: Any,
 ) -> Any:
     """Return a field with its default and its `Option`, or the fields of that."""
-    declared = shown if isinstance(shown, Option) else Option(shown, flags, kind, metavar, **more)
+    declared = about if isinstance(about, Option) else Option(about, flags, kind, metavar, **more)
     return field(default=default, metadata={"option": declared})
 
 
