@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -138,14 +138,12 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
         yield find_broken_seal(place.read(REPORT), place.where(REPORT)) or ("files", 1)
         card = parse_card(found.data, where, proved=False)
     checksums = parse_typed(parse_json(found.data, where), Checksums, where).checksums
-    wrong = list(find_wrong_files(place, checksums))
-    yield from _repair_by(Repair(f"{repair} with --force"), wrong)
-    yield "files", len(checksums)
+    is_whole = yield from _verify_files(place, checksums, f"{repair} with --force")
     is_local = kind == "dataset" and place.path is not None
     for name in find_foreign_files(Path(path), checksums) if is_local else find_unlisted_files(path):
         full = place.where(name) if is_local else name
         yield Repair(f"{full}: {_DESKTOP}") if is_desktop_file(name) else f"{full}: is no file of this {kind}"
-    if kind == "dataset" and not wrong:  # what nobody knows is not unfolded
+    if kind == "dataset" and is_whole:  # what nobody knows is not unfolded
         yield from _verify_counts(place.fetch(SAMPLES, checksums[SAMPLES]), card, where)
 
 
@@ -163,33 +161,20 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
         yield f"{where}: states that it has no coordinates, but {SAMPLES} has the columns {columns}; build it again"
 
 
-def _repair_by(repair: Repair, findings: Iterable[CheckResult]) -> Iterator[CheckResult]:
-    """Yield findings, and after each problem how to repair it."""
-    for finding in findings:
-        yield from (finding, repair) if isinstance(finding, str) else (finding,)
-
-
-def _verify_files(place: Place, checksums: Mapping[str, Checksum], repair: Repair) -> Iterator[CheckResult]:
-    """Read files again and compare them with what a document has of them."""
-    yield from _repair_by(repair, find_wrong_files(place, checksums))
-    yield "files", len(checksums)
+def _verify_files(place: Place, checksums: Mapping[str, Checksum], repair: str) -> Generator[CheckResult, None, bool]:
+    """Read files again and compare them with what a document has of them; return whether all are as they were written."""
+    wrong = list(find_wrong_files(place, checksums))
+    yield from (*wrong, *([Repair(repair)] if wrong else []), ("files", len(checksums)))
+    return not wrong
 
 
 def _verify_map(path: Path) -> Iterator[CheckResult]:
     """Yield the same of one map."""
     yield "maps", 1
     place, checksums = Place(path), read_checksums(path)
-    yield from _verify_files(place, checksums, Repair(f"{path}: copy it again, or add the map again with --force"))
+    yield from _verify_files(place, checksums, f"{path}: copy it again, or add the map again with --force")
     strange = [entry.name for entry in place.entries() if entry.name not in {*checksums, CHECKSUMS}]
     yield from (f"{place.where(name)}: is no file of this map" for name in strange if not is_desktop_file(name))
-
-
-def _isolate_errors(findings: Iterator[CheckResult], repair: Repair) -> Iterator[CheckResult]:
-    """Turn an error into problems, so that one damaged run or map does not hide the others."""
-    try:
-        yield from findings
-    except TcpipeError as error:
-        yield from _repair_by(repair, error.problems)
 
 
 def _verify_store(store: Store) -> Iterator[CheckResult]:
@@ -204,7 +189,7 @@ def _verify_store(store: Store) -> Iterator[CheckResult]:
         yield from (f"{missing}: is missing (run {problem.run_id})", Repair(_INGEST.format(problem.run_id)))
     for each in state.maps.values():
         yield "maps", 1
-        repair = Repair(f"map {each.name}: copy the store again, or add the map again with --force")
+        repair = f"map {each.name}: copy the store again, or add the map again with --force"
         yield from _verify_files(place.below(f"{BLOBS}/{each.blob}"), each.files, repair)
     yield from _verify_names(place, state)
 
@@ -231,8 +216,8 @@ def _is_damaged(place: Place, kind: Kind, name: str) -> bool:
 def _verify_page(place: Place) -> Iterator[CheckResult]:
     page, where = place.read(REPORT), place.where(REPORT)
     if page is not None:
-        repair = Repair(f"{where}: 'tcpipe report' writes it again")
-        yield from _repair_by(repair, [find_broken_seal(page, where) or ("files", 1)])
+        broken = find_broken_seal(page, where)
+        yield from (broken, Repair(f"{where}: 'tcpipe report' writes it again")) if broken else (("files", 1),)
 
 
 def _verify_runs(place: Place, runs: Iterable[tuple[RunFacts, str]]) -> Iterator[CheckResult]:
@@ -240,21 +225,22 @@ def _verify_runs(place: Place, runs: Iterable[tuple[RunFacts, str]]) -> Iterator
     known = set[str]()
     for row, document in runs:
         yield "runs", 1
-        repair, folder = Repair(_INGEST.format(f"{row.run_id}/{row.recipe_id}")), place.below(f"{BLOBS}/{row.blob}")
+        repair, folder = _INGEST.format(f"{row.run_id}/{row.recipe_id}"), place.below(f"{BLOBS}/{row.blob}")
         if row.streams_blob not in known:
             known.add(row.streams_blob)
             yield from _verify_files(place.below(f"{BLOBS}/{row.streams_blob}"), row.streams, repair)
-        wrong = list(find_wrong_files(folder, row.tables))
-        yield from _repair_by(repair, wrong)
-        yield "files", len(row.tables)
+        is_whole = yield from _verify_files(folder, row.tables, repair)
         yield from _verify_page(folder)
         if row.data_model_version != DATA_MODEL_VERSION:
             yield (
                 f"run {row.run_id}/{row.recipe_id}: is of data model {row.data_model_version}, this version reads "
                 f"{DATA_MODEL_VERSION}; ingest its log again"
             )
-        elif not wrong:
-            yield from _isolate_errors(_verify_rows(place, row, document), repair)
+        elif is_whole:
+            try:
+                yield from _verify_rows(place, row, document)
+            except TcpipeError as error:  # one damaged run does not hide the others
+                yield from (*error.problems, Repair(repair))
 
 
 def _verify_rows(place: Place, row: RunFacts, document: str) -> Iterator[CheckResult]:
