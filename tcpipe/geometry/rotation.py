@@ -116,14 +116,12 @@ def multiply(a_from_b_xyzw: ArrayLike, b_from_c_xyzw: ArrayLike) -> Floats:
 
 def invert(a_from_b_xyzw: ArrayLike) -> Floats:
     """Return b_from_a (..., 4) of unit quaternions: the conjugate."""
-    conjugate: Floats = np.asarray(a_from_b_xyzw, np.float64) * np.array([-1.0, -1.0, -1.0, 1.0])
-    return conjugate
+    return np.asarray(np.asarray(a_from_b_xyzw, np.float64) * np.array([-1.0, -1.0, -1.0, 1.0]))
 
 
 def rotate(a_from_b_xyzw: ArrayLike, vector: ArrayLike) -> Floats:
     """Return vectors (..., 3) given in b as coordinates in a."""
-    turned: Floats = np.einsum("...ij,...j->...i", matrix_from_quat(a_from_b_xyzw), np.asarray(vector))
-    return turned
+    return np.asarray(np.einsum("...ij,...j->...i", matrix_from_quat(a_from_b_xyzw), np.asarray(vector)))
 
 
 def quat_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Floats:

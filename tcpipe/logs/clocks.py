@@ -107,8 +107,7 @@ class SimulatedClock:
         log, clock = self.log_time_ns, self.clock_ns
         found = clock[0] + np.rint(np.interp(log_time_ns - log[0], log - log[0], clock - clock[0])).astype(np.int64)
         outside = np.minimum(log_time_ns - log[0], 0) + np.maximum(log_time_ns - log[-1], 0)
-        there: Ints = found + outside
-        return there
+        return np.asarray(found + outside)
 
     @property
     def rate(self) -> float:

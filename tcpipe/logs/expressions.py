@@ -93,8 +93,7 @@ class Expression:
     def _evaluate(self, node: ast.expr, read: Read) -> Floats:
         match node:
             case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
-                joined: Floats = _OPERATORS[type(op)](self._evaluate(left, read), self._evaluate(right, read))
-                return joined
+                return np.asarray(_OPERATORS[type(op)](self._evaluate(left, read), self._evaluate(right, read)))
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 return -self._evaluate(operand, read)
             case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):

@@ -162,8 +162,7 @@ def _is_absent(columns: Columns, name: str) -> Mask:
     """Whether a covariance says that its quantity is not measured: -1 in its first element (sensor_msgs/Imu), or all of it vast."""
     if name not in columns:
         return np.zeros(len(columns[LOG_TIME]), bool)
-    absent: Mask = (columns[name][:, 0] == -1) | (columns[name][:, [0, 4, 8]] >= _UNMEASURED_VAR).all(1)
-    return absent
+    return np.asarray((columns[name][:, 0] == -1) | (columns[name][:, [0, 4, 8]] >= _UNMEASURED_VAR).all(1))
 
 
 _UNMEASURED_VAR = 1e3

@@ -118,8 +118,7 @@ def _estimate_jitter(command: Floats, part: Ints, window: int) -> Floats:
     low, high = find_piece_bounds(part)
     row = np.arange(len(part))
     count_before, count_after = np.clip(row - low, 1, window), np.minimum(high - row + 1, window)
-    jitter: Floats = np.sqrt(scatter * (1.0 / count_before + 1.0 / count_after))
-    return jitter
+    return np.asarray(np.sqrt(scatter * (1.0 / count_before + 1.0 / count_after)))
 
 
 def _find_moment(command: Floats, before_mps: float, after_mps: float, *, step_mps: float) -> tuple[int, int]:

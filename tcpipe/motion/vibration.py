@@ -86,8 +86,7 @@ def _filter_band(values: Floats, period_s: float) -> Floats:
     power = 2 * _ORDER
     gain = 1.0 / ((1.0 + (frequency_hz / HIGH_HZ) ** power) * (1.0 + (LOW_HZ / frequency_hz) ** power))
     spectrum[0], spectrum[1:] = 0.0, spectrum[1:] * gain
-    passed: Floats = np.fft.irfft(spectrum, len(values))
-    return passed
+    return np.asarray(np.fft.irfft(spectrum, len(values)))
 
 
 def _is_without_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_s: float) -> Mask:
@@ -97,5 +96,4 @@ def _is_without_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_s: 
     before = np.searchsorted(stamp_ns, start_ns - near_ns, side="right") - 1
     after = np.searchsorted(stamp_ns, end_ns + near_ns, side="left")
     inside = (start_ns >= stamp_ns[0]) & (end_ns <= stamp_ns[-1])
-    known: Mask = inside & (gaps[np.minimum(after, last)] == gaps[np.maximum(before, 0)])
-    return known
+    return np.asarray(inside & (gaps[np.minimum(after, last)] == gaps[np.maximum(before, 0)]))

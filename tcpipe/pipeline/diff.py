@@ -132,8 +132,7 @@ def _compute_shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:
 
 
 def _read_values(table: pa.Table, name: str) -> Floats:
-    values: Floats = table.column(name).to_numpy().astype(np.float64)
-    return values
+    return np.asarray(table.column(name).to_numpy(), np.float64)
 
 
 def _measure_changes(directories: tuple[Path, Path]) -> dict[str, dict[str, float]]:
@@ -198,8 +197,7 @@ def _find_differing_patches(
     ours, theirs = (
         _hash_patches(directory, card, table) for directory, card, table in zip(directories, cards, tables, strict=True)
     )
-    differs: Mask = ours[in_a] != theirs[in_b]
-    return differs
+    return np.asarray(ours[in_a] != theirs[in_b])
 
 
 def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> Ints:
@@ -213,8 +211,7 @@ def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> Ints:
         found[files.starts[piece] : files.starts[piece + 1]] = [
             hash(b"".join(part.tobytes() for part in parts)) for parts in zip(*flat, strict=True)
         ]
-    places: Ints = found[find_places_in_files(card, table.column("split").to_numpy())]
-    return places
+    return np.asarray(found[find_places_in_files(card, table.column("split").to_numpy())])
 
 
 def _count_moved(ours: NDArray[np.object_], theirs: NDArray[np.object_]) -> dict[str, int]:

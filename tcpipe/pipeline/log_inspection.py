@@ -302,8 +302,7 @@ def _read_header_ns(table: pa.Table) -> Ints | None:
     if not set(_STAMP) <= set(table.column_names):
         return None
     seconds, nanoseconds = (table.column(name).to_numpy().astype(np.int64) for name in _STAMP)
-    stamps: Ints = seconds * SECOND_NS + nanoseconds
-    return stamps
+    return np.asarray(seconds * SECOND_NS + nanoseconds)
 
 
 def _find_repeated_rows(table: pa.Table, rows: Ints) -> Mask:

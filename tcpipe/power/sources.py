@@ -402,8 +402,7 @@ def _sum_fields(columns: Columns, fields: Sequence[FieldPath]) -> Floats:
         np.where(np.abs(values) <= _IMPOSSIBLE, values, np.nan)
         for values in (read_values(columns, field) for field in fields)
     ]
-    total: Floats = np.sum([field.sign * values for field, values in zip(fields, parts, strict=True)], axis=0)
-    return total
+    return np.asarray(np.sum([field.sign * values for field, values in zip(fields, parts, strict=True)], axis=0))
 
 
 _IMPOSSIBLE = 1e6

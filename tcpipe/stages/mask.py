@@ -291,8 +291,7 @@ def _compute_common_std_mps(track: Track) -> Floats:
     scale_std = find_common_scale_std(
         track.info.report.facts.fuse, to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch")
     )
-    common_mps: Floats = scale_std * speed_mps
-    return common_mps
+    return np.asarray(scale_std * speed_mps)
 
 
 def _subtract_variance(std: Floats, part: Floats) -> Floats:

@@ -38,8 +38,7 @@ def to_texts(column: pa.Array | pa.ChunkedArray) -> NDArray[np.str_]:
     """Return a column of texts, shape (N,)."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     encoded = array.dictionary_encode(null_encoding="encode")
-    found: NDArray[np.str_] = np.array(encoded.dictionary.to_pylist(), np.str_)[to_numbers(encoded.indices)]
-    return found
+    return np.asarray(np.array(encoded.dictionary.to_pylist(), np.str_)[to_numbers(encoded.indices)])
 
 
 def number_column(values: NDArray[Any], *, nan_is_null: bool = False) -> pa.Array:
@@ -190,8 +189,7 @@ class TableSchema:
 
 def to_floats(table: pa.Table, name: str) -> Floats:
     """Return a column as float64, null as NaN, shape (N,)."""
-    values: Floats = to_numbers(table.column(name)).astype(np.float64, copy=False)
-    return values
+    return np.asarray(to_numbers(table.column(name)), np.float64)
 
 
 def read_lonlat_deg(table: pa.Table, end: str) -> Floats:
@@ -206,8 +204,7 @@ def read_float_columns(table: pa.Table) -> dict[str, Floats]:
 
 def to_integers(table: pa.Table, name: str) -> Ints:
     """Return a column without nulls as int64, shape (N,)."""
-    values: Ints = to_numbers(table.column(name)).astype(np.int64, copy=False)
-    return values
+    return np.asarray(to_numbers(table.column(name)), np.int64)
 
 
 def _to_arrow(values: object, column: Column) -> pa.Array:

@@ -232,18 +232,15 @@ class MapGrid:
     def px_from_xy(self, xy_m: Floats) -> Floats:
         """Return pixel coordinates (x along columns, y along rows; centres are integers) of map points, (..., 2)."""
         corner = np.array([self.x_min_m, self.y_max_m])
-        px: Floats = (np.asarray(xy_m) - corner) * np.array([1.0, -1.0]) / self.pixel_size_m - 0.5
-        return px
+        return np.asarray((np.asarray(xy_m) - corner) * np.array([1.0, -1.0]) / self.pixel_size_m - 0.5)
 
     def xy_from_px(self, px: Floats) -> Floats:
         """Return map points [m] of pixel coordinates, shape (..., 2): the inverse of `px_from_xy`."""
         corner = np.array([self.x_min_m, self.y_max_m])
-        xy_m: Floats = corner + (np.asarray(px) + 0.5) * np.array([1.0, -1.0]) * self.pixel_size_m
-        return xy_m
+        return np.asarray(corner + (np.asarray(px) + 0.5) * np.array([1.0, -1.0]) * self.pixel_size_m)
 
     def contains(self, xy_m: Floats) -> Mask:
         """Return whether map points, shape (..., 2) [m], are finite and on the grid, outer edges included."""
         x_min, y_min, x_max, y_max = self.bounds_m
         x, y = xy_m[..., 0], xy_m[..., 1]
-        inside: Mask = (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)
-        return inside
+        return np.asarray((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max))

@@ -159,8 +159,7 @@ def _find_stray(time_us: Ints) -> Mask:
     if len(time_us) < _WINDOW or not (steps < 0).any():
         return np.zeros(len(time_us), np.bool_)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(time_us, _WINDOW // 2, mode="edge"), _WINDOW)
-    is_stray: Mask = np.abs(time_us - np.median(around, axis=1)) > _STRAY_US + 10 * np.median(np.abs(steps))
-    return is_stray
+    return np.asarray(np.abs(time_us - np.median(around, axis=1)) > _STRAY_US + 10 * np.median(np.abs(steps)))
 
 
 def read_autopilot_records(path: Path, kind: AutopilotKind) -> AutopilotRecords:

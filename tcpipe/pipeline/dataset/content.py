@@ -108,8 +108,7 @@ class SampleTable:
     def _centres_deg(self, patches: Ints) -> Floats:
         """Return the centre of patches of ``sampled``, WGS 84 lon, lat [deg], shape (N, 2)."""
         corners = np.unwrap(self.sampled.footprint_lonlat_deg[patches], axis=1, period=360.0)  # on the date line
-        centres: Floats = corners.mean(axis=1)
-        return centres
+        return np.asarray(corners.mean(axis=1))
 
     def __len__(self) -> int:
         """Return the number of samples."""

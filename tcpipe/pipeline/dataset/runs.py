@@ -222,8 +222,7 @@ class Need:
 
     def find_rows(self, segments: pa.Table) -> Mask:
         """Return the segments that have them, shape (M,)."""
-        known: Mask = np.all(np.isfinite([to_floats(segments, name) for name in self.columns]), axis=0)
-        return known
+        return np.asarray(np.all(np.isfinite([to_floats(segments, name) for name in self.columns]), axis=0))
 
     def is_met_by(self, run: StoredRun) -> bool:
         """Return whether any segment of a run has them."""
