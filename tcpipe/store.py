@@ -20,17 +20,7 @@ from pathlib import Path
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.atomic import Location, check_input, check_local_output, make_unique_name
-from tcpipe.formats.documents import (
-    BLOBS,
-    KINDS,
-    Kind,
-    Record,
-    State,
-    make_key,
-    make_run_key,
-    put_document,
-    scan,
-)
+from tcpipe.formats.documents import BLOBS, KINDS, Kind, Record, State, make_key, make_run_key, put_document, scan
 from tcpipe.formats.documents import parse_name as parse_document_name
 from tcpipe.formats.integrity import CHECKSUMS, compute_checksums
 from tcpipe.formats.object_storage import is_bucket, is_url

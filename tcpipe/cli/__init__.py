@@ -174,8 +174,7 @@ def _debug_option(*, hidden: bool) -> Callable[[C], C]:
 
 
 @click.group(
-    cls=_Group,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110, "show_default": True},
+    cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110, "show_default": True}
 )
 @click.version_option(__version__, prog_name="tcpipe")
 @_debug_option(hidden=False)

@@ -120,15 +120,7 @@ def benchmark(
 @json_option
 @quiet_option
 def reproduce(
-    directory: str,
-    *,
-    size: Size,
-    quick: bool,
-    seeds: int,
-    jobs: int,
-    baselines: bool,
-    as_json: bool,
-    quiet: bool,
+    directory: str, *, size: Size, quick: bool, seeds: int, jobs: int, baselines: bool, as_json: bool, quiet: bool
 ) -> None:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and test the claims of the paper.
 

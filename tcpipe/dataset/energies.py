@@ -26,11 +26,7 @@ class Energy:
 ENERGIES: Mapping[str, Energy] = {
     "total": Energy("power_watt", "power_std_watt", "energy_joule", "energy_std_joule", "total"),
     "net": Energy(
-        "net_power_watt",
-        "net_power_std_watt",
-        "net_energy_joule",
-        "net_energy_std_joule",
-        "net of idle power",
+        "net_power_watt", "net_power_std_watt", "net_energy_joule", "net_energy_std_joule", "net of idle power"
     ),
 }
 

@@ -379,9 +379,7 @@ def judge_dataset(findings: Iterable[Finding], runs: Iterable[RunSource], maps: 
 
 
 def group_dataset_findings(
-    findings: Sequence[Finding],
-    by_run: Mapping[str, Sequence[Finding]],
-    by_map: Mapping[str, Sequence[Finding]] = {},
+    findings: Sequence[Finding], by_run: Mapping[str, Sequence[Finding]], by_map: Mapping[str, Sequence[Finding]] = {}
 ) -> list[tuple[FindingGroup[str], int | None, str]]:
     """Return all findings of a dataset grouped by code, each group with how many runs or maps there are and the word for them."""
     own = [(finding.subject.name, [finding]) for finding in findings if finding.subject.kind != "run"]

@@ -146,12 +146,7 @@ Drawer = ZarrShardWriter | ParquetShardWriter
 
 
 def make_zarr_writers(
-    directory: Path,
-    pixels: Pixels,
-    sample_ids: pa.ChunkedArray,
-    *,
-    compression: Compression,
-    threads: int,
+    directory: Path, pixels: Pixels, sample_ids: pa.ChunkedArray, *, compression: Compression, threads: int
 ) -> list[Drawer]:
     """Write ``patches.zarr`` into the dataset's directory, all but the layers' shards; return these, to be written.
 

@@ -106,11 +106,7 @@ def _locate(stamp_ns: Ints, at_ns: Ints) -> tuple[NDArray[np.intp], Floats, Floa
 
 
 def _compute_partial_length_m(
-    xy_m: Floats,
-    velocity_mps: Floats,
-    row: NDArray[np.intp],
-    until: Floats,
-    step_s: Floats,
+    xy_m: Floats, velocity_mps: Floats, row: NDArray[np.intp], until: Floats, step_s: Floats
 ) -> Floats:
     """Return the length from each row's sample to the share ``until`` (M, 1) of its interval."""
     u = (until * (0.5 * (_GAUSS_NODES + 1.0)))[:, :, None]

@@ -17,13 +17,7 @@ from tcpipe.dataset.energies import EnergyName
 from tcpipe.errors import DatasetError
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.recipe_toml import load_shipped_profiles
-from tcpipe.learning.baselines import (
-    KIND_OF_BASELINE,
-    SPLITS,
-    BaselineResult,
-    compare_baselines,
-    find_best,
-)
+from tcpipe.learning.baselines import KIND_OF_BASELINE, SPLITS, BaselineResult, compare_baselines, find_best
 from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import (
     ALL,
@@ -206,12 +200,7 @@ Said = Mapping[str, Predicted]
 
 
 def evaluate(
-    model: Location,
-    dataset: Location,
-    config: EvaluateConfig,
-    *,
-    key: str,
-    predictor: str | None = None,
+    model: Location, dataset: Location, config: EvaluateConfig, *, key: str, predictor: str | None = None
 ) -> tuple[Evaluation, pa.Table]:
     """Measure a model on a dataset; return the evaluation, with the hash ``key``, and the table of all predictions."""
     ours = load_model(model, predictor)
@@ -282,9 +271,7 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig) -> Iterat
         for at, (name, found) in enumerate(sets.items()):
             draws = [
                 _compute_errors(
-                    predict_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)),
-                    found,
-                    ours,
+                    predict_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)), found, ours
                 )
                 for draw in range(config.noise_draws if noise else 1)
             ]

@@ -15,21 +15,10 @@ from tcpipe.dataset.energies import ENERGIES
 from tcpipe.learning.baselines import SPLITS
 from tcpipe.learning.evaluation import EXPECTED, OURS, UNKNOWN_DISTANCE, Evaluation
 from tcpipe.learning.metrics import ALL, LEAST, UNITS, Errors
-from tcpipe.learning.predictions import (
-    compute_cost_errors,
-    find_main_cost,
-    find_worst_rows,
-    make_column_name,
-)
+from tcpipe.learning.predictions import compute_cost_errors, find_main_cost, find_worst_rows, make_column_name
 from tcpipe.learning.predictor import find_kind
 from tcpipe.report.colours import FAINT, choose_class_colours
-from tcpipe.report.page import (
-    Number,
-    PageSection,
-    Shaded,
-    render_page,
-    show_verdict,
-)
+from tcpipe.report.page import Number, PageSection, Shaded, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot, show_text
 from tcpipe.tables.columns import to_floats, to_texts
 from tcpipe.tables.findings import judge_again, read_threshold
@@ -223,11 +212,7 @@ def _make_other_sections(found: Evaluation) -> list[PageSection]:
 
 
 def _make_other_section(
-    title: str,
-    text: str,
-    found: Evaluation,
-    quantity: Literal["E", "T"],
-    errors: Mapping[str, Mapping[str, Errors]],
+    title: str, text: str, found: Evaluation, quantity: Literal["E", "T"], errors: Mapping[str, Mapping[str, Errors]]
 ) -> PageSection:
     """Return errors of a quantity by predictor, on every split, beside the paper's."""
     splits = found.ordered_splits

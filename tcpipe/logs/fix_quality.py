@@ -48,11 +48,7 @@ _WORDS: tuple[tuple[str, float], ...] = (
     (r"dgps|dgnss|diff|sbas|waas|egnos|ppp", _DIFFERENTIAL),
     (r"single|auto|stand|\bspp|\bsps|gps|gnss|fix|[23]d", _SINGLE),
 )
-CODES_OF_NAMES = {
-    "rtklib": r"q",
-    "ublox": r"(.*[_.])?carr(ier)?_?sol\w*",
-    "gga": r"(.*[_.])?(gga|fix|gps)_?qual(ity)?",
-}
+CODES_OF_NAMES = {"rtklib": r"q", "ublox": r"(.*[_.])?carr(ier)?_?sol\w*", "gga": r"(.*[_.])?(gga|fix|gps)_?qual(ity)?"}
 """Patterns of names, in lower case, of columns whose names state the kind of their codes."""
 _EQUAL_FEWEST = 20
 

@@ -112,10 +112,7 @@ def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
         factor = f" * {UNITS['rad/s'][unit]:.9g}" if unit != "rad/s" else ""
         return {"linear_x": f"{mean}{factor} * 0.1"}
     to_mps = f" * {UNITS['m/s'][unit]:.9g}" if UNITS["m/s"].get(unit, 1.0) != 1.0 else ""
-    return {
-        "linear_x": mean,
-        "angular_z": f"({' + '.join(right)} - {' - '.join(left)}) / {len(left)}{to_mps} / 0.5",
-    }
+    return {"linear_x": mean, "angular_z": f"({' + '.join(right)} - {' - '.join(left)}) / {len(left)}{to_mps} / 0.5"}
 
 
 _PLAIN = re.compile(r"[A-Za-z_]\w*")

@@ -179,10 +179,7 @@ class Audit:
         """Return it as a table, in metres."""
         lines = [f"{self.run}: robot {self.robot}"]
         if self.scores:
-            lines += [
-                "m: median and 95 % of the errors of withheld fixes, their median σ; shares inside 1σ and 2σ",
-                "",
-            ]
+            lines += ["m: median and 95 % of the errors of withheld fixes, their median σ; shares inside 1σ and 2σ", ""]
             rows = [_HEADER, *map(_make_row, self.scores)]
             widths = [max(len(row[k]) for row in rows) for k in range(len(_HEADER))]
             lines += [

@@ -16,13 +16,7 @@ from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, clean_lines
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.dataset_card import DatasetCard, MapSource
-from tcpipe.formats.dataset_files import (
-    SAMPLES,
-    is_shard,
-    read_intact_card,
-    read_samples,
-    sample_columns,
-)
+from tcpipe.formats.dataset_files import SAMPLES, is_shard, read_intact_card, read_samples, sample_columns
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_table

@@ -88,11 +88,7 @@ class Exported:
 
 
 def export(
-    log_path: Location,
-    out: Path,
-    *,
-    topics: Sequence[str] = (),
-    message_definitions: Path | None = None,
+    log_path: Location, out: Path, *, topics: Sequence[str] = (), message_definitions: Path | None = None
 ) -> Exported:
     """Write each topic to ``out/<topic>.parquet``: one row a message, columns by dotted field name, the definition in the metadata.
 

@@ -167,10 +167,7 @@ def preflight(
 
 
 def _summarize(
-    seen: InspectedLog,
-    labelled: LabelledSegments | None,
-    missing: tuple[Finding, ...],
-    problems: tuple[str, ...],
+    seen: InspectedLog, labelled: LabelledSegments | None, missing: tuple[Finding, ...], problems: tuple[str, ...]
 ) -> Preflight:
     report = labelled.info.report if labelled else NOTHING_FOUND
     expected_yield = _estimate_yield(labelled) if labelled else None

@@ -33,10 +33,7 @@ from tcpipe.report.page import is_made_from
 from tcpipe.report.run_report import run_report
 from tcpipe.report.store_report import FailedLog, RunKey, StoredDataset, StoreFacts, store_report
 from tcpipe.store import Store, find_named_runs, is_path, is_store
-from tcpipe.tables.findings import (
-    judge_by_code,
-    read_catalogue_version,
-)
+from tcpipe.tables.findings import judge_by_code, read_catalogue_version
 
 _FEW_RUNS = 10
 """The page of a store with fewer runs begins with their tracks and the table."""
@@ -53,11 +50,7 @@ class Page:
 
 
 def report(
-    path: Location,
-    *,
-    store: Location = "tcpipe-store",
-    recipe: Recipe | Location | None = None,
-    runs: bool = True,
+    path: Location, *, store: Location = "tcpipe-store", recipe: Recipe | Location | None = None, runs: bool = True
 ) -> list[Page]:
     """Write ``report.html`` into a dataset or a store, here or at a URL, or beside the tables of a run of the store; return the pages.
 

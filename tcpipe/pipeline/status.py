@@ -18,23 +18,12 @@ from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_findin
 from tcpipe.formats.object_storage import format_path
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Call, Problem
-from tcpipe.pipeline.calls import (
-    INGEST,
-    OpenCall,
-    format_duration,
-    list_ended_calls,
-    list_open_calls,
-)
+from tcpipe.pipeline.calls import INGEST, OpenCall, format_duration, list_ended_calls, list_open_calls
 from tcpipe.pipeline.ingest import CallOptions, make_tasks
 from tcpipe.pipeline.log_sources import list_log_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogState, PlannedLog, plan_ingestion
-from tcpipe.pipeline.problems import (
-    find_incomplete_maps,
-    find_incomplete_runs,
-    find_stale_outputs,
-    make_missing,
-)
+from tcpipe.pipeline.problems import find_incomplete_maps, find_incomplete_runs, find_stale_outputs, make_missing
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Finding

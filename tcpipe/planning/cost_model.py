@@ -186,11 +186,7 @@ class SegmentPredictions:
 
 
 def iterate_predictions(
-    model: Model,
-    source: MapReader,
-    batches: Iterable[PatchFrames],
-    *,
-    turn_radpm: Floats | None = None,
+    model: Model, source: MapReader, batches: Iterable[PatchFrames], *, turn_radpm: Floats | None = None
 ) -> Iterator[SegmentPredictions]:
     """Yield the predictions of each batch of frames, in order; tiles of the map are kept from batch to batch.
 

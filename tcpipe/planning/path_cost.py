@@ -21,13 +21,7 @@ from tcpipe.formats.json_files import write_json
 from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.learning.models import Model
 from tcpipe.path import find_cuts
-from tcpipe.planning.cost_model import (
-    Reason,
-    SegmentPredictions,
-    check_model,
-    count_reasons,
-    predict_segments,
-)
+from tcpipe.planning.cost_model import Reason, SegmentPredictions, check_model, count_reasons, predict_segments
 from tcpipe.planning.frames import find_lonlat_projection
 from tcpipe.planning.search import Turning, compute_course_changes, find_turning
 from tcpipe.splits.audit import PLACES, compute_middles

@@ -73,12 +73,7 @@ from tcpipe.tables.levels import (
 
 
 def label_segments(
-    segments: Segments,
-    masked: MaskedTrack,
-    streams: Streams,
-    config: LabelConfig,
-    *,
-    robot: Robot,
+    segments: Segments, masked: MaskedTrack, streams: Streams, config: LabelConfig, *, robot: Robot
 ) -> LabelledSegments:
     """Return the segments with w, v, T, E, their standard deviations, and quality bits.
 

@@ -195,11 +195,7 @@ def _find_in_map(source: MapReader, config: SampleConfig, projection: Projection
         return findings
     remedies = suggest("match", {"sample": {"patch_px": round(config.patch_m / map_pixel_m)}})
     other = make_finding(
-        "patch-pixels-unlike-map",
-        subject,
-        remedies=remedies,
-        patch_pixel_m=patch_pixel_m,
-        map_pixel_m=map_pixel_m,
+        "patch-pixels-unlike-map", subject, remedies=remedies, patch_pixel_m=patch_pixel_m, map_pixel_m=map_pixel_m
     )
     return (*findings, other)
 

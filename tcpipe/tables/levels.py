@@ -150,11 +150,7 @@ POWER = _make_stream_schema(
     _make_nullable(
         "voltage_volt", "V", "voltage; null where this row carries only a current; 1 if only power [W] is known"
     ),
-    _make_nullable(
-        "current_amp",
-        "A",
-        "current, positive when drawn; null where this row carries only a voltage",
-    ),
+    _make_nullable("current_amp", "A", "current, positive when drawn; null where this row carries only a voltage"),
 )
 
 COMMAND = _make_stream_schema(

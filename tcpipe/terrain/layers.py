@@ -308,11 +308,7 @@ def sort_layers(layers: Mapping[str, Layer]) -> dict[str, Layer]:
 def join_layers(maps: Sequence[Mapping[str, Layer]]) -> dict[str, Layer]:
     """Return the layers that maps have in common, each with the range of all."""
     return {
-        name: replace(
-            layer,
-            low=min(each[name].low for each in maps),
-            high=max(each[name].high for each in maps),
-        )
+        name: replace(layer, low=min(each[name].low for each in maps), high=max(each[name].high for each in maps))
         for name, layer in maps[0].items()
     }
 

@@ -262,14 +262,7 @@ def _fit_slopes(rise: Floats32, good: Mask, side: int) -> tuple[float, float]:
 
 
 @compile_kernel
-def _find_class_under(
-    near: Bytes,
-    width: int,
-    box: Ints,
-    chord: Floats,
-    points: int,
-    votes: Ints,
-) -> tuple[int, float]:
+def _find_class_under(near: Bytes, width: int, box: Ints, chord: Floats, points: int, votes: Ints) -> tuple[int, float]:
     """Return the commonest class at points on the chord and its share of those that have one; ties go low."""
     votes[:] = 0
     for k in range(points):

@@ -401,10 +401,7 @@ def _find_message(data: bytes, start: int, lengths: list[int]) -> int:
 
 
 def _define_format(
-    data: bytes,
-    at: int,
-    lengths: list[int],
-    formats: dict[int, tuple[str, Layout, dict[str, float]]],
+    data: bytes, at: int, lengths: list[int], formats: dict[int, tuple[str, Layout, dict[str, float]]]
 ) -> None:
     """Read a format; the first of a number holds, and of one that contradicts itself only the length of its messages."""
     kind, length, name, letters, labels = struct.unpack_from("<BB4s16s64s", data, at)

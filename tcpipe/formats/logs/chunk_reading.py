@@ -309,13 +309,7 @@ def group_chunks(sizes: Iterable[int]) -> Iterator[range]:
 
 
 def sort_by_place(
-    chunk: Ints,
-    channel: Ints,
-    offset: Ints,
-    log_time_ns: Ints,
-    sizes: Ints,
-    *,
-    least_bytes: int,
+    chunk: Ints, channel: Ints, offset: Ints, log_time_ns: Ints, sizes: Ints, *, least_bytes: int
 ) -> tuple[Entries, Mask]:
     """Return index entries (shape (N,) each) in their order in chunks of ``sizes`` bytes, and which chunks' are sound.
 

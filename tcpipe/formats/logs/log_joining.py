@@ -22,13 +22,7 @@ from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.logs.log_file import Log, OpenLog, find_autopilot, open_log
 from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.logs.rosbag2 import is_one_bag
-from tcpipe.formats.logs.table_folders import (
-    AUTOPILOT_SUFFIXES,
-    Mappings,
-    find_table_run,
-    is_log_file,
-    is_table,
-)
+from tcpipe.formats.logs.table_folders import AUTOPILOT_SUFFIXES, Mappings, find_table_run, is_log_file, is_table
 from tcpipe.formats.object_storage import format_path, is_url, lay_out_objects
 from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding

@@ -15,12 +15,7 @@ import numpy as np
 from isal.isal_zlib import crc32
 
 from tcpipe.arrays import Ints, Mask
-from tcpipe.formats.logs.chunk_reading import (
-    MAX_PLANNED_BYTES,
-    ChunkedPart,
-    Excerpt,
-    Messages,
-)
+from tcpipe.formats.logs.chunk_reading import MAX_PLANNED_BYTES, ChunkedPart, Excerpt, Messages
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     DamageError,

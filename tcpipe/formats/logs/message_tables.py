@@ -78,11 +78,7 @@ def make_stamp_fields(stamp_ns: Ints) -> dict[str, Ints]:
 
 
 def make_topic(
-    name: str,
-    type_name: str,
-    stamp_ns: Ints,
-    read_fields: Callable[[], Fields],
-    damage: Sequence[Damage] = (),
+    name: str, type_name: str, stamp_ns: Ints, read_fields: Callable[[], Fields], damage: Sequence[Damage] = ()
 ) -> TopicMessages:
     """Return a topic with the stamps of its messages [ns], shape (N,), as both log times; `_make_column` converts its fields."""
 

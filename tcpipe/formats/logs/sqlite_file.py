@@ -19,12 +19,7 @@ import numpy as np
 
 from tcpipe.errors import LogError
 from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
-from tcpipe.formats.logs.log_part import (
-    MAX_CHANNELS,
-    Bounds,
-    MessageBlock,
-    group_by_key,
-)
+from tcpipe.formats.logs.log_part import MAX_CHANNELS, Bounds, MessageBlock, group_by_key
 from tcpipe.logs.topics import Damage, Topic, normalize_type_name
 
 MAGIC = b"SQLite format 3\0"

@@ -108,11 +108,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
 
 
 def _read_messages(
-    read_as: tuple[str, str, str],
-    file: str,
-    values: Mapping[str, Floats],
-    stamps: Clock,
-    damage: Sequence[Damage],
+    read_as: tuple[str, str, str], file: str, values: Mapping[str, Floats], stamps: Clock, damage: Sequence[Damage]
 ) -> TopicMessages:
     """Return a table as the messages of its topic, type and role, in order of time, and its damage with that of its cells.
 

@@ -263,13 +263,7 @@ class MapWriter:
     """Writes a map and its overviews shard by shard into a directory; `finish` makes it complete."""
 
     def __init__(
-        self,
-        directory: Path,
-        *,
-        name: str,
-        grid: MapGrid,
-        scheme: ClassScheme,
-        layers: Mapping[str, Layer],
+        self, directory: Path, *, name: str, grid: MapGrid, scheme: ClassScheme, layers: Mapping[str, Layer]
     ) -> None:
         self._name, self._grid, self._scheme, self._layers = name, grid, scheme, layers
         self._factors = list_factors(grid)

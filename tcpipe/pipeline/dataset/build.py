@@ -196,10 +196,7 @@ def _build(
         if isinstance(place, Path):
             keep_foreign_files(foreign, place, directory)
     result = replace(_make_result(place, "done", card, job.left_out, reported), foreign_files=foreign)
-    call.result |= {
-        "exit_code": result.exit_code,
-        "counts": {"runs": len(job.inputs.runs), "samples": card.samples},
-    }
+    call.result |= {"exit_code": result.exit_code, "counts": {"runs": len(job.inputs.runs), "samples": card.samples}}
     return result, job.inputs
 
 

@@ -30,21 +30,10 @@ from tcpipe.formats.dataset_card import (
     group_dataset_findings,
     list_shifts,
 )
-from tcpipe.formats.dataset_files import (
-    FileFormat,
-    ParquetShardWriter,
-    Pixels,
-    make_parquet_writers,
-    make_zarr_writers,
-)
+from tcpipe.formats.dataset_files import FileFormat, ParquetShardWriter, Pixels, make_parquet_writers, make_zarr_writers
 from tcpipe.formats.finding_lines import format_finding, format_groups
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.parquet import (
-    ROWS_PER_GROUP,
-    add_geo_metadata,
-    move_to_file,
-    take_rows,
-)
+from tcpipe.formats.parquet import ROWS_PER_GROUP, add_geo_metadata, move_to_file, take_rows
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.zarr_arrays import Compression
@@ -223,18 +212,8 @@ def gather_content(directory: Path, inputs: ChosenInputs, options: BuildOptions,
             *_describe_uncertainty(segments, lost_m, inputs, recipe),
         )
     tags = read_tags(pc.unique(segments.column("run_id")).to_pylist(), inputs.sources, recipe.split)
-    assigned, result = draw_splits(
-        segments,
-        sampled,
-        projection,
-        options.regions,
-        recipe,
-        tags=tags,
-    )
-    unused = {
-        Loss.SPLIT_BUFFER: assigned.is_in("buffer"),
-        Loss.SPLIT_EXCLUDED: assigned.is_in(EXCLUDED),
-    }
+    assigned, result = draw_splits(segments, sampled, projection, options.regions, recipe, tags=tags)
+    unused = {Loss.SPLIT_BUFFER: assigned.is_in("buffer"), Loss.SPLIT_EXCLUDED: assigned.is_in(EXCLUDED)}
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
     unused_m = {loss: arc_m[rows].sum() for loss, rows in unused.items()}
     shifted = [finding for _, findings in registered for finding in findings]

@@ -25,12 +25,7 @@ from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.projection import Projection
-from tcpipe.terrain.registration import (
-    REACH_M,
-    HeightScale,
-    Registration,
-    register_track,
-)
+from tcpipe.terrain.registration import REACH_M, HeightScale, Registration, register_track
 from tcpipe.terrain.sampling import find_classes_at
 from tcpipe.terrain.tiles import find_map_projection
 

@@ -13,14 +13,7 @@ import pyarrow as pa
 from tcpipe.formats.atomic import write_text
 from tcpipe.formats.croissant import format_croissant
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import (
-    CARD,
-    CLASSES,
-    CROISSANT,
-    OVERVIEW,
-    RELIEF,
-    SAMPLES,
-)
+from tcpipe.formats.dataset_files import CARD, CLASSES, CROISSANT, OVERVIEW, RELIEF, SAMPLES
 from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.parquet import map_table, write_parquet_rows, write_pieces
