@@ -365,7 +365,7 @@ class DatasetCard:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedDataset(DatasetCard):
-    """Card of a dataset, as `tcpipe inspect` prints it."""
+    """Card of a dataset."""
 
     kind: Literal["dataset"] = "dataset"
     path: str

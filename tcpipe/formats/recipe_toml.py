@@ -121,9 +121,10 @@ def _iterate_toml_lines(definitions: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _iterate_table_lines(head: str, values: Any, definitions: Mapping[str, Any], *, mark: str = "") -> Iterator[str]:
-    definition = definitions[type(values).__name__]
+    cls: type = type(values)
+    definition = definitions[cls.__name__]
     yield from ("", *(f"# {line}" for line in definition["description"].splitlines() if line), head)
-    for name, kind in read_annotations(type(values)).items():
+    for name, kind in read_annotations(cls).items():
         lines = _iterate_key_lines(definition["properties"][name], name, getattr(values, name), format_values(kind))
         yield from (f"{mark}{line}" for line in lines)
 

@@ -72,7 +72,7 @@ class MapSummary(MapFacts):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedMap(MapSummary):
-    """Summary of a map, as `tcpipe inspect` prints it."""
+    """Summary of a map."""
 
     kind: Literal["map"] = "map"
     path: str
