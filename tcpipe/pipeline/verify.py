@@ -164,7 +164,10 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
 def _verify_files(place: Place, checksums: Mapping[str, Checksum], repair: str) -> Generator[CheckResult, None, bool]:
     """Read files again and compare them with what a document has of them; return whether all are as they were written."""
     wrong = list(find_wrong_files(place, checksums))
-    yield from (*wrong, *([Repair(repair)] if wrong else []), ("files", len(checksums)))
+    yield from wrong
+    if wrong:
+        yield Repair(repair)
+    yield "files", len(checksums)
     return not wrong
 
 
@@ -240,7 +243,8 @@ def _verify_runs(place: Place, runs: Iterable[tuple[RunFacts, str]]) -> Iterator
             try:
                 yield from _verify_rows(place, row, document)
             except TcpipeError as error:  # one damaged run does not hide the others
-                yield from (*error.problems, Repair(repair))
+                yield from error.problems
+                yield Repair(repair)
 
 
 def _verify_rows(place: Place, row: RunFacts, document: str) -> Iterator[CheckResult]:
