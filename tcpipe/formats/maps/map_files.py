@@ -80,7 +80,7 @@ class _Attributes:
     tile_px: int
     height_reference_m: float
     facts: MapFacts
-    picture_shape: tuple[int, int, int] | None = field(default=None, metadata=LEFT_OUT)
+    picture_shape: tuple[int, int, int] | None = omit()
     """Rows, columns and colours of the picture of an orthophoto in colour."""
 
 
