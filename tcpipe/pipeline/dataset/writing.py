@@ -70,7 +70,8 @@ def write_dataset(directory: Path, inputs: ChosenInputs, options: BuildOptions, 
 def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
     """Write the samples; return the columns that card and page are made from, mapped from another file."""
     asked = dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS))
-    names = [name for name in asked if name in samples.schema.names]
+    schema = samples.schema
+    names = [name for name in asked if name in schema.names]
 
     def write_both() -> Iterator[pa.Table]:
         for piece in samples.pieces():
@@ -80,8 +81,8 @@ def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
             yield few
             del few
 
-    with write_parquet_rows(path, samples.schema) as write:
-        write_pieces(mapped, pa.schema([samples.schema.field(name) for name in names]), write_both())
+    with write_parquet_rows(path, schema) as write:
+        write_pieces(mapped, pa.schema([schema.field(name) for name in names]), write_both())
     return map_table(mapped)
 
 
