@@ -188,49 +188,6 @@ def test_a_box_and_filters_make_one_selection_that_every_view_shows(opened):
     assert not opened.locator("#selected").is_visible()
 
 
-def test_a_range_is_drawn_in_the_histogram_or_typed(opened):
-    opened.select_option("#quantity", "velocity")
-    drag(opened, "histogram", (0.3, 0.5), (0.6, 0.5))
-    until(opened, f"{SELECTED}.length > 0")
-    least, most = (float(opened.locator(f"#{end}").input_value()) for end in ("least", "most"))
-    velocity = column(opened, "velocity")
-    inside = [i for i, value in enumerate(velocity) if least <= value <= most]
-    assert 0 < len(inside) < len(velocity)
-    assert opened.evaluate(SELECTED) == inside
-    opened.fill("#most", f"{max(velocity) + 1}")
-    opened.locator("#most").press("Tab")
-    assert opened.evaluate(SELECTED) == [i for i, value in enumerate(velocity) if least <= value]
-    opened.fill("#least", f"{max(velocity) + 1}")
-    opened.locator("#least").press("Tab")
-    assert "No sample passes all filters" in opened.locator("#chosen").inner_text()
-    assert opened.locator("#gallery button").count() == 0
-
-
-def test_patches_and_rows_are_sorted_and_turned_page_by_page(opened):
-    opened.select_option("#run", label="south")
-    power, run, std = (column(opened, name) for name in ("power", "run", "power_std"))
-    chosen = [i for i, of in enumerate(run) if of == 1]
-    for option, key in {
-        "w, largest first": lambda i: -power[i],
-        "w, smallest first": lambda i: power[i],
-        "σ of w": lambda i: -std[i],
-    }.items():
-        opened.select_option("#sort", option)
-        wanted = sorted(chosen, key=lambda i: (key(i), i))
-        shown = list(table_ids(opened))
-        words = opened.locator("#gallery button").all_inner_texts()
-        assert opened.locator("#page-count").inner_text() == f"1 to 24 of {len(chosen)}"
-        assert len(shown) == len(words) == 24
-        opened.locator("#gallery button").nth(3).click()
-        assert shown[3] in opened.locator("#chosen").inner_text()
-        assert f"Number {chosen.index(wanted[3]) + 1} of them" in opened.locator("#chosen").inner_text()
-        assert opened.locator("#gallery button").nth(3).get_attribute("aria-pressed") == "true"
-    while opened.locator("#page-after").is_enabled():
-        opened.locator("#page-after").click()
-        shown += table_ids(opened)
-    assert len(set(shown)) == len(shown) == len(chosen)
-
-
 @pytest.mark.parametrize("look", [LOOKS[0], LOOKS[3]], ids=by_look)
 def test_ids_of_a_selection_open_these_samples(chromium, dataset, tmp_path, look):
     with quiet_page(chromium, dataset / "report.html", look) as tab:
@@ -271,20 +228,6 @@ def test_a_selection_is_a_part_of_the_address(chromium, dataset):
     assert again.evaluate(SELECTED) == chosen
     assert again.url == address
     context.close()
-
-
-def test_it_is_worked_by_keyboard(opened):
-    opened.locator("#after").focus()
-    opened.keyboard.press("Enter")
-    opened.keyboard.press("Enter")
-    assert opened.evaluate(f"{SOURCE}.selected.indices") == [1]
-    opened.keyboard.press("Shift+Tab")
-    assert opened.evaluate("document.activeElement.id") == "row"
-    opened.locator("#run").focus()
-    opened.keyboard.press("ArrowDown")
-    opened.locator("#gallery button").first.focus()
-    opened.keyboard.press("Enter")
-    assert opened.evaluate("document.activeElement.ariaPressed") == "true"
 
 
 def test_an_evaluation_is_read_by_everyone_and_names_the_worst(judged):

@@ -62,17 +62,6 @@ def test_a_few_samples_of_a_class_do_not_make_its_bias():
         assert least < power[0] - 1.0 < most
 
 
-def test_the_few_samples_of_a_class_err_alike_and_make_no_bias_of_it():
-    """Six metres at one place, met by two folds that knew the class by four and by two: 30 % off, all of them, is no bias of the class."""
-    residuals = made_residuals(150, sigma=0.02)
-    few = {**residuals, "terrain_class": np.where(np.abs(np.arange(150) - 40) < 3, 7, 4).astype(np.uint8)}
-    few["terrain_class"][43] = 7
-    power, _ = fit_bias_correction(_with_power(few, 0.7, few["terrain_class"] == 7)).apply(
-        np.ones(1), np.ones(1), np.array([7])
-    )
-    assert power[0] == pytest.approx(1.0, abs=0.03)
-
-
 @pytest.mark.parametrize(("is_everywhere", "power_ratio"), [(True, 1.25), (False, 1.0)])
 def test_a_bias_of_the_only_fold_with_a_class_is_none_of_the_model(is_everywhere, power_ratio):
     """Forty metres of a class, all but three in one fold: what the other folds say of it there is not what the model of all folds says."""

@@ -1,5 +1,3 @@
-import inspect
-import itertools
 import pickle
 import shutil
 
@@ -198,14 +196,6 @@ def test_every_epoch_has_its_own_order_and_the_same_seed_the_same(path, from_dis
     for mine, again in zip((first, second), orders(0), strict=True):
         np.testing.assert_array_equal(mine, again)
     assert not np.array_equal(first, orders(1)[0])
-
-
-def test_what_keras_wants_never_ends(train):
-    batches = train.batches(100, shuffle=True, weights=True)
-    assert inspect.isgenerator(batches.forever())  # Keras takes no other iterator
-    found = list(itertools.islice(batches.forever(), 2 * len(batches)))
-    assert [len(labels) for _, labels, _ in found] == [100, 100, 21] * 2
-    assert found[0][2].shape == (100, 2)
 
 
 def test_a_label_whose_error_is_not_known_weighs_nothing(train):

@@ -74,20 +74,6 @@ def test_scores_are_those_of_their_definitions():
     assert found.coverage_percent == 50.0
 
 
-def test_scores_of_classes_are_those_of_all_samples_and_absent_where_nothing_is_stated():
-    rng = np.random.default_rng(0)
-    measured, ids = rng.uniform(100.0, 200.0, 90), rng.choice([4, 5], 90)
-    predicted = measured + rng.normal(0.0, 9.0, 90)
-    spread = _spread(predicted, rng.uniform(6.0, 12.0, 90))
-    by_class = compute_errors_by_class({"E": predicted}, {"E": measured}, ids, {4: "grass", 5: "mud"}, {"E": spread})[
-        "E"
-    ]
-    pooled = compute_errors(predicted, measured, LEAST["E"], spread)
-    for score in ("coverage_percent", "nll", "crps"):
-        assert getattr(by_class[ALL], score) == pytest.approx(getattr(pooled, score))
-    assert compute_errors(predicted, measured).nll is None
-
-
 def test_a_ratio_by_hand():
     ours, theirs = np.array([1.0, 4.0, 4.0]), np.array([16.0, 16.0, 4.0])
     rmse = compare_errors(ours, theirs, np.array(["a", "a", "b"]), seed=0)

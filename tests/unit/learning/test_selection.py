@@ -5,13 +5,9 @@ import pytest
 from installed_command import tcpipe
 
 from tcpipe.dataset import Split, open_dataset
-from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import load_model
-from tcpipe.learning.physics_model import fit_curves
-from tcpipe.learning.training import choose_kind, is_within_error, train
-
-real_labels = Split.labels.func
+from tcpipe.learning.training import choose_kind, is_within_error
 
 
 def noise(split):
@@ -77,14 +73,3 @@ def test_the_command_says_what_it_compared_and_chooses_once(dataset, tmp_path):
     again = tcpipe("train", dataset, "model", cwd=tmp_path)
     assert "nothing to do" in again.stdout
     assert "chooses" not in again.stderr
-
-
-def test_curves_are_models_like_the_others(dataset, tmp_path):
-    train(dataset, tmp_path / "model", config=FitConfig(model="linear"))
-    model, data = load_model(tmp_path / "model"), open_dataset(dataset)
-    split, features = data["train"], read_extra_features(data["train"])
-    curves = fit_curves(features.slope_rad, features.class_id, split.labels.astype(np.float64))
-    there = read_extra_features(data["unseen"])
-    said = model.predict(data["unseen"].with_channels("height").patches, there).mean
-    assert said == pytest.approx(curves.predict(there.slope_rad, there.class_id), rel=1e-6)
-    assert not model.takes_turns

@@ -68,14 +68,6 @@ def test_the_model_knows_what_it_was_trained_on(trained, dataset):
     assert said[:, 0] == pytest.approx([by_id[name] for name in held.column("sample_id")], rel=1e-4)
 
 
-def test_net_energy_can_be_trained_on(dataset, tmp_path):
-    train(dataset, tmp_path / "model", config=replace(CONFIG, epochs=1, label="net"))
-    card = load_model(tmp_path / "model").card
-    split, names = open_dataset(dataset, label="net")["train"], ("net_power_watt", "velocity_mps")
-    assert (card.label_energy, card.inputs.outputs) == ("net", names)
-    assert card.inputs.scale == pytest.approx(tuple(float(split.column(name).max()) for name in names))
-
-
 @pytest.mark.parametrize(
     ("held", "rate"),
     [

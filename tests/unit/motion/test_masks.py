@@ -146,14 +146,6 @@ def test_a_limit_itself_is_not_below_nor_above_it():
     assert not masks.find_below_full_speed(mean_is_the_limit, limit_mps=0.5, window_s=0.1).any()
 
 
-def test_which_row_of_a_change_of_direction_stands():
-    assert masks.find_stationary(rows([0.2, -0.3]), **STANDING).tolist() == [True, False]
-    assert masks.find_stationary(rows([0.05, -0.05]), **STANDING).tolist() == [True, False]  # of two as slow, the first
-    assert not masks.find_stationary(rows([0.04, -0.3], yaw_rate=1.0), **STANDING).any()
-    apart = replace(rows([0.2, -0.3]), piece=np.array([0, 1]))
-    assert not masks.find_stationary(apart, **STANDING).any()
-
-
 @pytest.mark.parametrize(("window_s", "half"), [(0.05, 1), (0.40, 4), (0.45, 4), (0.50, 4)])
 def test_the_slope_is_over_the_window_that_is_asked_for(window_s, half):
     made = rows(np.random.default_rng(2).normal(0, 1, 40))
@@ -201,9 +193,3 @@ def test_twice_what_jitter_leaves_is_allowed_for(step, found):
 def test_a_command_that_ends_or_steps_across_a_hole_is_no_change():
     assert changed([1.0] * 20 + [np.nan] * 20) == []
     assert changed([0.0] * 20 + [1.0] * 20, piece=[0] * 20 + [1] * 20) == []
-
-
-def test_a_short_dip_does_not_bring_the_mean_below_the_limit():
-    commanded = np.ones(25)
-    commanded[10:15] = 0.5  # over eleven rows the mean is 0.77, over seven 0.64
-    assert not masks.find_below_full_speed(rows(0 * commanded, commanded=commanded), limit_mps=0.75, window_s=0.5).any()

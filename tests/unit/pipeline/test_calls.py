@@ -11,17 +11,14 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 from click.testing import CliRunner
-from object_gateway import open_bucket
-from synthetic_store import add_run, lanes, segments
 from wheel_drives import START_NS, ask_status, drive_at
 
 from tcpipe.cli import cli
-from tcpipe.errors import StoreError, TcpipeError, UsageError
-from tcpipe.formats import documents
+from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.formats.runs import Call
 from tcpipe.pipeline import calls
 from tcpipe.pipeline import ingest as ingest_module
-from tcpipe.pipeline.calls import close_call, identify_process, list_open_calls, record_call
+from tcpipe.pipeline.calls import identify_process, list_open_calls, record_call
 from tcpipe.pipeline.ingest import CallOptions, ingest
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.recipe import LabelConfig, Recipe
@@ -30,13 +27,10 @@ from tcpipe.store import open_store
 NIGHT_S = 86_400
 
 
-@pytest.fixture(params=["directory", "bucket"])
-def root(request, tmp_path, monkeypatch):
+@pytest.fixture
+def root(tmp_path):
     """Where a store is to be."""
-    if request.param == "directory":
-        return tmp_path / "store"
-    url = open_bucket(request.param, request, monkeypatch, tmp_path)
-    return f"{url}/store"
+    return tmp_path / "store"
 
 
 @pytest.fixture(scope="module")
@@ -168,17 +162,6 @@ def test_a_call_that_runs_is_no_problem(root, logs):
     assert ask_status(root).open_calls == ()
 
 
-def test_a_call_with_nothing_to_do_writes_its_record_alone(root, logs):
-    ingest([logs], store=root, recipe=Recipe())
-    store = open_store(root)
-    before = {entry.name for entry in store.place.entries()}
-    again = ingest([logs], store=root, recipe=Recipe())
-    assert [result.status for result in again.results] == ["unchanged"] * 2
-    new = {entry.name for entry in store.place.entries()} - before
-    assert len(new) == 2
-    assert all(name.startswith("calls/") for name in new)
-
-
 def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
     assert ask_status(root).exit_code == 3
@@ -198,17 +181,6 @@ def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypat
     assert ask_status(root).exit_code == 0, "a folder is all the logs in it"
 
 
-def test_a_killed_call_may_be_acknowledged_and_the_next_one_is_told_again(root, logs, monkeypatch):
-    kill(logs, root, monkeypatch)
-    (call,) = ask_status(root).open_calls
-    with pytest.raises(UsageError, match="nosuch: is no run, log or dataset with a known problem"):
-        acknowledge(["nosuch"], store=root)
-    assert [of.finding.code for of in acknowledge([call.name], store=root).acknowledged] == ["call-killed"]
-    assert (ask_status(root).exit_code, ask_status(root).open_calls) == (0, ())
-    kill(logs, root, monkeypatch)
-    assert ask_status(root).exit_code == 3
-
-
 def test_a_killed_call_is_not_closed_by_one_under_another_recipe(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
     ingest([logs], store=root, recipe=Recipe(label=LabelConfig(velocity="fused")))
@@ -216,47 +188,6 @@ def test_a_killed_call_is_not_closed_by_one_under_another_recipe(root, logs, mon
     assert ask_status(root).counts == {"outdated": 2}, "status asks under the recipe that rules now"
     ingest([logs], store=root, recipe=Recipe())
     assert list_open_calls(open_store(root).scan()) == []
-
-
-@pytest.mark.parametrize("how", ["the same work", "acknowledge"])
-def test_a_call_whose_end_is_damaged_is_closed_like_a_killed_one(root, logs, monkeypatch, how):
-    with monkeypatch.context() as patch:
-        patch.setattr(calls, "identify_process", lambda: replace(identify_process(), start="1"))
-        ingest([logs], store=root, recipe=Recipe())
-    store = open_store(root)
-    state = store.scan()
-    ((key, _),) = state.calls
-    store.place.put(state.names["calls", key], b"half of i")
-    documents._DECODED.clear()  # as another process
-    (killed,) = ask_status(root).open_calls
-    assert killed.state == "killed"
-    if how == "acknowledge":
-        acknowledge([killed.name], store=root)
-    else:
-        ingest([logs], store=root, recipe=Recipe())
-    assert list_open_calls(store.scan()) == []
-    assert (store.scan().damaged, ask_status(root).exit_code) == ([], 0)
-
-
-def test_a_call_that_ends_while_another_takes_it_for_killed_keeps_its_own_end(root, logs):
-    """Its process is gone, and the scan was made before it ended."""
-    ingest([logs / "one.mcap"], store=root, recipe=Recipe())
-    store = open_store(root)
-    with record_call(store, "ingest", ["/logs"], CallOptions()) as call:
-        before = store.scan()
-        call.result = {"exit_code": 3, "message": "its own"}
-    (open_call,) = list_open_calls(before)
-    close_call(store, before, open_call, "acknowledged as killed")
-    assert read_calls(root)[-1] == ("ingest", 3, "its own")
-
-
-def test_an_error_ends_a_call_and_an_interrupt_leaves_it(tmp_path):
-    store = open_store(tmp_path, create=True)
-    add_run(store, "a", segments("a", *lanes(0.0, 0.0, 5.0)))
-    for error, left in ((StoreError("full"), 0), (KeyboardInterrupt(), 1)):
-        with suppress(StoreError, KeyboardInterrupt), record_call(store, "ingest", ["/logs"]):
-            raise error
-        assert len(list_open_calls(store.scan())) == left
 
 
 HERE = {"host": "lab", "machine": "m", "boot": "b", "namespace": "pid:[1]", "pid": os.getpid()}
@@ -321,20 +252,3 @@ def test_status_without_logs_asks_with_the_options_that_the_latest_call_was_give
     assert ask_status(store, logs).counts == {"outdated": 2}, "who names the logs names the options, too"
     assert ingest([logs], store=store, recipe=Recipe()).exit_code == 0
     assert ask_status(store).counts == {"done": 2}
-
-
-def test_status_without_logs_asks_each_folder_as_the_call_was_that_was_given_it(tmp_path, logs):
-    store, parts, definitions = tmp_path / "store", tmp_path / "parts", tmp_path / "definitions"
-    definitions.mkdir()
-    (definitions / "Own.msg").write_text("float64 volt\n")
-    parts.mkdir()
-    for number in range(2):
-        drive_at(parts / f"{number}.mcap", seed=8 + number, start_ns=START_NS + number * 10**11)
-    for path in parts.iterdir():
-        os.utime(path, ns=(10**18, 10**18))
-    assert ingest([parts], store=store, recipe=Recipe(), as_one=True).exit_code == 0
-    assert ingest([logs], store=store, recipe=Recipe(), msgdef=definitions).exit_code == 0
-    found = ask_status(store)
-    assert (found.counts, found.problems) == ({"done": 3}, ())
-    assert ask_status(store, parts).counts == {"pending": 2}
-    assert ask_status(store, logs).counts == {"outdated": 2}

@@ -1,7 +1,6 @@
 """A dataset of the runs that carry given tags."""
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +13,7 @@ from tcpipe.formats.recipe_toml import make_recipe_id
 from tcpipe.pipeline.calls import list_ended_calls
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.prune import prune
-from tcpipe.recipe import ReadConfig, Recipe
+from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Remedy, Subject, select_findings
 
@@ -86,17 +84,6 @@ def test_a_dry_run_counts_and_a_build_is_remembered(store, tmp_path):
     after = store.scan()
     assert {kind for (kind, _), name in after.names.items() if name not in before.names.values()} == {"calls"}
     assert [call.counts for call in list_ended_calls(before)] == [{"runs": 3, "samples": made.card.samples}]
-
-
-def test_a_dataset_in_the_place_of_another_releases_the_runs_of_the_other(store, tmp_path):
-    out, old = tmp_path / "out", replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
-    add_run(store, "a", segments("a", *lanes(np.array([0.0]), -10.0, 10.0)), recipe=old)
-    build_dataset(out, store=store.root, recipe=old)
-    (kept,) = prune(store=store.root, recipe=Recipe(), dry_run=True).kept
-    assert kept.stays == f"dataset {out} refers to it"
-    build_dataset(out, store=store.root, recipe=Recipe(), force=True)
-    found = prune(store=store.root, recipe=Recipe(), dry_run=True)
-    assert ([each.what for each in found.removed], found.kept) == (["old recipe"], ())
 
 
 def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_is_not_known_there(

@@ -5,7 +5,6 @@ import json
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from autopilot_files import Drive, write_ulog
 from mcap.writer import Writer
 from random_messages import ROS1, Message, random_messages, write_mcap
 
@@ -113,15 +112,6 @@ def test_files_that_are_none_of_an_export_are_not_overwritten(tmp_path, log):
     assert export(log, tmp_path / "other").status == "done"
 
 
-def test_what_is_damaged_is_said_again_by_the_second_call(tmp_path):
-    path = write_mcap(tmp_path / "a.mcap", random_messages(4, count=200, types=TYPES), chunk_bytes=2048)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    first = export(path, tmp_path / "out")
-    second = export(path, tmp_path / "out")
-    assert (first.status, second.status) == ("done", "unchanged")
-    assert second.damage == first.damage != ()
-
-
 def of_one_message(path, type_name, definition, payload):
     with path.open("wb") as file:
         writer = Writer(file)
@@ -148,23 +138,3 @@ def test_names_that_make_one_file_name_get_files_of_their_own(tmp_path):
     assert sorted(files.values()) == names
     alone = export(path, tmp_path / "other", topics=["a/b"]).topics
     assert [of.path.name for of in alone] == [files["a/b"]]
-
-
-def test_messages_without_fields_inside_arrays(tmp_path):
-    definition = "Nothing[2] pair\nNothing[] some\nfloat32 x\n" + "=" * 80 + "\nMSG: acme/Nothing\n"
-    payload = b"\0\1\0\0" + b"\0\0" + b"\0\0" + b"\3\0\0\0" + b"\0\0\0" + b"\0" + b"\0\0\x80\x3f"
-    path = of_one_message(tmp_path / "a.mcap", "acme/Both", definition, payload)
-    (of,) = export(path, tmp_path / "out").topics
-    (row,) = pq.read_table(of.path).to_pylist()
-    nothing = {"structure_needs_at_least_one_member": None}
-    assert (row["pair"], row["some"], row["x"]) == ([nothing] * 2, [nothing] * 3, 1.0)
-
-
-def test_a_log_of_an_autopilot_is_exported_without_definitions(tmp_path):
-    log = write_ulog(tmp_path / "a.ulg", Drive())
-    made = export(log, tmp_path / "out", topics=["/sensor_combined"])
-    (file,) = made.topics
-    assert file.messages == pq.read_metadata(file.path).num_rows > 0
-    about = described(file.path)
-    assert (about["type"], about["definition"], about["definition_from"]) == ("px4/msg/sensor_combined", "", "")
-    assert export(log, tmp_path / "out", topics=["/sensor_combined"]).status == "unchanged"

@@ -131,11 +131,3 @@ def test_a_voltage_of_its_own_may_be_slow(tmp_path):
     found, topics = inspected(tmp_path / "a.mcap", streams)
     assert topics["/battery/voltage"].role == topics["/battery/current"].role == "power"
     assert not select_findings(found.findings, "power-too-slow")
-
-
-def test_a_topic_that_plays_two_roles_names_both(tmp_path):
-    log_ns = START_NS + np.arange(20) * 10**9
-    columns = {"sentence": np.full(20, "$GPGGA,", "S")}
-    _, topics = inspected(tmp_path / "a.mcap", [MessageStream("/gps/nmea", "nmea_msgs/msg/Sentence", log_ns, columns)])
-    assert topics["/gps/nmea"].role == "gnss, gnss_velocity"
-    assert topics["/gps/nmea"].why == "the only nmea_msgs/msg/Sentence; the receiver's sentences"

@@ -86,21 +86,6 @@ def test_a_young_log_waits_and_is_no_failure(tmp_path, night):
     assert night(min_age=1e12)[0]["other.mcap"].status == "unchanged"  # what is there does not wait
 
 
-def test_a_log_that_changes_while_it_is_looked_at_waits_also_where_it_cannot_be_read_yet(tmp_path, night, monkeypatch):
-    log = tmp_path / "logs" / "other.mcap"
-
-    def growing(*_, **__):
-        with log.open("ab") as file:
-            file.write(b"more")
-        raise ValueError("half a message")
-
-    monkeypatch.setattr(ingestion, "_read", growing)
-    found, code = night()
-    assert (found["other.mcap"].status, code) == ("waiting", 0)
-    monkeypatch.undo()
-    assert night()[0]["other.mcap"].status == "damaged"  # nothing of it was remembered as a failure
-
-
 # --- known trouble --------------------------------------------------------------------------------------------------
 
 
@@ -207,21 +192,6 @@ def test_a_document_that_is_damaged_and_that_no_call_writes_again_is_acknowledge
     assert [run.facts.tags for run in store.runs()] == [{"weather": "wet"}]
 
 
-def test_what_is_there_already_needs_no_worker_and_no_reader(tmp_path, night, monkeypatch):
-    (tmp_path / "logs" / "junk.bag").write_bytes(JUNK)
-    drive_at(tmp_path / "logs" / "second.mcap")
-    night()
-
-    def refused(*_, **__):
-        raise AssertionError
-
-    monkeypatch.setattr("tcpipe.execution.ProcessPoolExecutor", refused)
-    monkeypatch.setattr(ingestion, "open_logs", refused)
-    found, code = night(jobs=8)
-    assert code == 0
-    assert [result.status for result in found.values()] == ["failed", "unchanged", "unchanged"]
-
-
 def test_runs_of_two_recipes_live_side_by_side_and_share_their_streams(tmp_path, night, monkeypatch):
     night(tag={"soil": "dry"})
     other = Recipe(label=LabelConfig(velocity="fused"))
@@ -236,26 +206,6 @@ def test_runs_of_two_recipes_live_side_by_side_and_share_their_streams(tmp_path,
         assert {
             result.status for result in ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=recipe).results
         } == {"unchanged"}
-
-
-def test_of_two_calls_that_ingest_one_recording_under_two_names_there_is_one_run(tmp_path, night, monkeypatch):
-    shutil.copy(drive_at(tmp_path / "elsewhere" / "first.mcap", seed=7), tmp_path / "logs" / "second.mcap")
-    real = ingestion.run_stages
-
-    def meanwhile(*args, run_id):
-        if run_id.startswith("second"):
-            monkeypatch.setattr(ingestion, "run_stages", real)
-            ingest([tmp_path / "elsewhere"], store=tmp_path / "store", recipe=Recipe())
-        return real(*args, run_id=run_id)
-
-    monkeypatch.setattr(ingestion, "run_stages", meanwhile)
-    found, code = night()
-    assert (found["second.mcap"].status, code) == ("done", 0)
-    assert len(counted(tmp_path)) == 2, "of this and of other.mcap"
-    found, code = night()
-    assert (found["second.mcap"].status, code) == ("unchanged", 0)
-    (kept,) = counted(tmp_path) - {found["other.mcap"].run.run_id}
-    assert found["second.mcap"].run.run_id == kept
 
 
 def test_a_night_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, served):

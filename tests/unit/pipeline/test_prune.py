@@ -212,20 +212,3 @@ def test_the_payload_of_a_killed_call_goes_at_once(store, monkeypatch):
     assert prune(store=store.root, recipe=Recipe()).removed == found.removed
     assert not left.exists()
     assert not holder.exists()
-
-
-def test_of_ended_calls_the_latest_of_each_command_stay_and_open_ones_do(store, monkeypatch):
-    monkeypatch.setattr("tcpipe.pipeline.prune._MAX_CALLS", 3)
-    with monkeypatch.context() as patch:
-        patch.setattr(calls, "identify_process", lambda: replace(identify_process(), start="1"))
-        record_call(store, INGEST, ["/killed"]).__enter__()
-    for number in range(5):
-        with record_call(store, INGEST, [f"/logs/{number}"]) as call:
-            call.begin()
-    with record_call(store, "add-map", ["site"]):
-        pass
-    prune(store=store.root, recipe=Recipe())
-    kept = [(call.command, *call.works_on) for _, call in store.scan().calls]
-    latest = [(INGEST, f"/logs/{number}") for number in (4, 3, 2)]
-    assert kept == [("prune",), ("add-map", "site"), *latest, (INGEST, "/killed")]
-    assert len(list_open_calls(store.scan())) == 1

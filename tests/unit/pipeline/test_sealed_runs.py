@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 from stored_files import flip, manifest, table
-from synthetic_store import add_run, box, lanes, open_world, region_file, segments, supersede, tag_run
+from synthetic_store import add_run, lanes, open_world, segments, tag_run
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
@@ -127,14 +127,6 @@ def test_runs_of_the_dataset_before_that_the_store_no_longer_knows_are_told_once
     assert build(store).exit_code == 0
 
 
-def test_a_run_that_another_has_taken_the_place_of_is_not_gone(store):
-    build(store)
-    supersede(store, "b", "a")
-    result = build(store)
-    assert (problems(result), runs(store)) == ([], ["a", "c", "d"])
-    assert ("run-superseded", "b") in {(of.code, of.subject.name) for of in result.findings}
-
-
 def test_what_a_user_leaves_out_by_choice_is_no_problem(store):
     tag_run(store, "d", {"weather": "wet"})
     build(store)
@@ -143,17 +135,6 @@ def test_what_a_user_leaves_out_by_choice_is_no_problem(store):
     under_another_recipe(store, "c")
     assert build(store, robot="warthog", force=True).exit_code == 0
     assert build(store, robot="husky", force=True).exit_code == 3
-
-
-@pytest.mark.parametrize(("x_m", "holdout", "empty"), [(20, "sample", "unseen"), (0, "run", "test")])
-def test_a_split_that_is_empty_is_told_and_fails_the_first_time(store, tmp_path, x_m, holdout, empty):
-    for run_id in "bcd":
-        remove(store, run_id)
-    region = region_file(tmp_path / "region.geojson", box(-20, -20, x_m, 20))
-    for exit_code in (3, 0):  # it is known then
-        result = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), holdout=holdout, split=region)
-        assert problems(result) == [("split-empty", empty)]
-        assert result.exit_code == exit_code
 
 
 def test_streams_that_are_not_as_they_were_written_are_made_again(store):

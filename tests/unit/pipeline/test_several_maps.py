@@ -13,7 +13,6 @@ from tcpipe.errors import DatasetError, MapError
 from tcpipe.formats.dataset_files import read_card, read_samples
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.pipeline.dataset import sampling as dataset_sampling
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.report.pictures import compute_joint_bounds_m, draw_maps
@@ -122,21 +121,3 @@ def test_what_cannot_be_built_from_is_said_in_one_line(store, tmp_path):
     with pytest.raises(DatasetError, match=r"3 maps in the store .*name one with --map, or several"):
         build(store, tmp_path / "out", None)
     assert not (tmp_path / "out").exists()
-
-
-def test_maps_are_held_open_only_while_samples_are_taken(store, tmp_path, monkeypatch):
-    """One more map than a process holds; and what goes wrong leaves none behind."""
-    seen = []
-
-    def failing(*arguments, **keywords):
-        seen.append(len(dataset_sampling._held))
-        raise MapError("a tile is damaged")
-
-    monkeypatch.setattr(dataset_sampling, "_HELD_MAPS", 1)
-    assert build(store, tmp_path / "out", ("west", "east")).card.samples > 180
-    assert not dataset_sampling._held
-    monkeypatch.setattr(dataset_sampling, "sample_on_maps", failing)
-    with pytest.raises(MapError, match="a tile is damaged"):
-        build(store, tmp_path / "other", ("west", "east"))
-    assert seen == [1]
-    assert not dataset_sampling._held

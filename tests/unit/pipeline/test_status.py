@@ -197,40 +197,12 @@ def test_a_failure_that_was_acknowledged_is_tried_again_under_another_recipe_and
     assert told(other) == ("pending", f"failed with tcpipe {__version__}, acknowledged; to be tried again")
 
 
-def test_logs_with_findings_of_one_code_are_one_line_with_the_first_cause(first_night, tmp_path):
-    logs = tmp_path / "logs"
-    logs.mkdir()
-    shutil.copytree(first_night / "store", tmp_path / "store")
-
-    def told():
-        ingest([logs], store=tmp_path / "store", recipe=Recipe())
-        (group,) = where(tmp_path).groups
-        return len(group.logs), group.cause.partition(";")[0]
-
-    (logs / "a.bag").write_bytes(bytes(30))
-    assert told() == (1, "not a log: it begins with zeros")
-    assert "a .bag (2.0), a .db3, a ROS 2 bag directory" in str(where(tmp_path))
-    shutil.copy2(first_night / "logs" / "junk.bag", logs / "b.bag")
-    (logs / "c.bag").write_bytes(b"junk" * 10)
-    (logs / "a.bag").unlink()
-    assert told() == (2, "2 reasons, the first: not a log: it is 400 bytes that begin with b'junkjunk'")
-
-
-@pytest.mark.parametrize("how", ["gone", "pruned", "acknowledged"])
-def test_a_run_whose_tables_are_gone_is_named_and_asked_for_again_until_it_is_given_up(first_night, tmp_path, how):
+@pytest.mark.parametrize("how", ["pruned", "acknowledged"])
+def test_a_run_whose_tables_were_given_up_is_superseded(first_night, tmp_path, how):
     root = shutil.copytree(first_night / "store", tmp_path / "store", copy_function=shutil.copy2)
     store, log = Store(root), str(first_night / "logs" / "whole.mcap")
     (row,) = [row for row in store.scan().list_rows() if row.run_id.startswith("whole-")]
     shutil.rmtree(root / "blobs" / row.blob)
-    if how == "gone":
-        found = ask_status(root, first_night / "logs")
-        (group,) = [group for group in found.groups if group.state == "pending"]
-        assert (group.cause, group.logs) == ("the files of its run are missing", (log,))
-        assert [(of.code, of.names["file"]) for of in found.problems] == [("run-incomplete", f"blobs/{row.blob}")]
-        assert found.exit_code == 3
-        assert ingest([first_night / "logs"], store=root, recipe=Recipe()).exit_code == 0
-        assert ask_status(root, first_night / "logs").problems == ()
-        return
     acknowledge([row.run_id], store=root) if how == "acknowledged" else forget_tables(store, store.scan(), row)
     found = ask_status(root, first_night / "logs")
     (group,) = [group for group in found.groups if group.state == "superseded"]

@@ -63,19 +63,6 @@ def test_when_the_longest_is_given_up_the_next_one_counts_again(store):
     assert counted(store) == ["middle"]
 
 
-def test_a_run_whose_folder_is_gone_supersedes_none_whose_tables_are_there(store):
-    for name, length_s in (("short", 5), ("middle", 7), ("long", 9)):
-        put(store, name, length_s)
-    (long,), (middle,) = (store.scan().list_rows(name) for name in ("long", "middle"))
-    store.place.delete(f"blobs/{long.blob}")
-    assert superseded(store) == {"short": "middle"}
-    assert counted(store) == ["middle"]
-    store.place.delete(f"blobs/{middle.blob}")
-    assert superseded(store) == {}
-    put(store, "long", 9)
-    assert superseded(store) == {"short": "long", "middle": "long"}
-
-
 @pytest.mark.parametrize(
     "other",
     [

@@ -142,22 +142,6 @@ def test_tables_of_two_drives_are_not_mixed(tmp_path):
     assert "no time in common" in text
 
 
-def test_speeds_of_both_sides_in_other_units_words_and_a_counter_are_read_in_si(tmp_path):
-    write(
-        tmp_path / "wheels.csv", time=UTC_S + SECONDS, **{"velL__(km/h)": 3.6 + SECONDS, "velR__(km/h)": 7.2 + SECONDS}
-    )
-    write(tmp_path / "gps.csv", time=UTC_S + SECONDS, **FIXES, fix__type="RTK Fixed")
-    write(tmp_path / "power.csv", time=UTC_S + SECONDS, **{"energy__(Wh)": SECONDS / 3600})
-    values, recipe, _ = proposed(tmp_path)
-    assert values["tables"]["gnss"]["columns"]["quality"] == "words: fix type"
-    assert values["tables"]["power"]["columns"] == {"energy": "energy (Wh)"}
-    assert recipe.tables["wheel_odometry"].units == {"linear_x": "km/h", "angular_z": "rad/s"}
-    log = open_single_log(tmp_path, message_definitions=None, tables=recipe.tables)
-    odometry = log.tables(["/wheel_odometry"])["/wheel_odometry"]
-    assert odometry["twist.twist.linear.x"].to_numpy() == pytest.approx(1.5 + SECONDS / 3.6)
-    assert odometry["twist.twist.angular.z"].to_numpy() == pytest.approx(1.0 / 0.5)  # of the track width of the comment
-
-
 def test_one_table_of_odd_names_is_fixes_wheels_and_power(tmp_path):
     table = {"Timestamp_us": WALL_NS // 1000, "GPS__Lat": 26.37 + 1e-6 * np.arange(ROWS), "GPS__Lng": -80.1}
     table |= {"Alt__MSL__(ft)": 10.0, "Fix__Quality": 4, "spd_L__(km/h)": 1.8, "spd_R__(km/h)": 1.9, "SoC__%": 80}

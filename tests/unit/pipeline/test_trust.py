@@ -75,12 +75,11 @@ def dress(store):
 SEALED = ("dataset.json", "report.html")
 
 
-@pytest.mark.parametrize("name", ["zarr", "parquet", "store"])
-def test_a_changed_byte_anywhere_is_found_and_its_file_is_named(copy, name):
-    directory, rng = copy(name), np.random.default_rng(0)
-    if name == "store":
-        dress(Store(directory))
-        (directory / "index.parquet").unlink(missing_ok=True)  # nobody trusts it: test_index.py
+def test_a_changed_byte_anywhere_in_a_store_is_found_and_its_file_is_named(copy):
+    """Those in a dataset: tests/property/test_dataset_damage.py."""
+    directory, rng = copy("store"), np.random.default_rng(0)
+    dress(Store(directory))
+    (directory / "index.parquet").unlink(missing_ok=True)
     listed = [path for path in files(directory) if path.name not in SEALED]
     whole = {path: path.read_bytes() for path in files(directory)}
     for place in (0.0, *rng.random(2), 1.0):  # all that are listed at once, then each sealed one alone
@@ -106,26 +105,6 @@ def test_a_card_that_counts_otherwise_is_found(copy, key, value):
     write_sealed(directory / "dataset.json", {**card, key: value})
     told = f"{directory / 'dataset.json'}: {key} has {7 if value else 0} samples, but samples.parquet has 448"
     assert verify(directory).problems == (told,)
-
-
-@pytest.mark.parametrize("key", ["runs", "maps", "checksums", "distance_by_reason_m", "layers", "made_from"])
-def test_a_card_that_lacks_something_is_one_problem_and_no_traceback(copy, key):
-    directory = copy("parquet")
-    card = json.loads((directory / "dataset.json").read_text())
-    del card[key]
-    write_sealed(directory / "dataset.json", card)
-    (problem,) = verify(directory).problems
-    assert problem.endswith(f"dataset.json: is not what this version writes: {key} is missing")
-
-
-def test_files_that_went_or_came_are_found(copy):
-    directory = copy("zarr")
-    (directory / "overview.png").unlink()
-    (directory / "notes.txt").write_text("mine")
-    assert [problem.split(": ")[1] for problem in verify(directory).problems[:2]] == [
-        "is missing",
-        "is no file of this dataset",
-    ]
 
 
 def test_a_manifest_that_counts_otherwise_is_found(copy):
@@ -212,14 +191,6 @@ def test_a_dataset_of_another_version_is_told_so_by_whoever_reads_it(tmp_path, a
     (tmp_path / "d" / "dataset.json").write_text(json.dumps(card))
     with pytest.raises(DatasetError, match=said):
         ASK[ask](tmp_path / "d")
-
-
-def test_two_formats_hold_the_same_samples(made):
-    found = diff(made / "zarr", made / "parquet")
-    assert found.causes == ("format: zarr → parquet",)
-    assert {name: count for name, count in found.samples.items() if count} == {"in both": 448}
-    assert found.moved == {}
-    assert diff(made / "zarr", made / "zarr").same
 
 
 def test_causes_and_effects_are_named(made, copy, tmp_path):

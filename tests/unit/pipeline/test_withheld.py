@@ -85,18 +85,6 @@ def test_an_error_of_the_track_is_what_the_fixes_show_of_it(streams, track, monk
     assert score.compared <= 10 * score.windows, "one a second"
 
 
-def test_a_sigma_is_held_against_errors_of_its_size(streams, track, monkeypatch):
-    def score(claimed_m):
-        return score_comparisons(audited(streams, track, monkeypatch, shift(0.3, claimed_m), windows_s=(5.0,)))
-
-    honest, tenth, vast = score(0.3), score(0.03), score(3.0)
-    assert honest.calibration == "calibrated"
-    assert honest.median_std_m == pytest.approx(0.3 * np.sqrt(2.0), rel=0.01)
-    assert tenth.calibration == "overconfident"
-    assert tenth.within_2_sigma < 0.5 < honest.within_2_sigma
-    assert (vast.calibration, vast.within_1_sigma) == ("underconfident", 1.0)
-
-
 def test_what_is_not_known_of_the_lever_arm_is_no_part_of_the_antennas_sigma(streams, track, monkeypatch):
     """The σ of base_link contains 0.5 m of the arm along each axis of the body; the antenna is known to 0.3 m."""
     stated = replace(streams, sensors={**streams.sensors, "gnss": sensor((0.0, 0.0, 0.0))})

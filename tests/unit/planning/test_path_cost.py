@@ -48,21 +48,6 @@ def test_a_model_of_the_velocity_along_the_surface_takes_longer_for_a_metre_of_t
     assert along.totals.energy_joule == pytest.approx(ground.totals.energy_joule * longer, rel=2e-3)
 
 
-def test_the_rest_of_a_path_is_paid_by_its_length():
-    source = plane()
-    found = _cost(source, (5.0, 5.0), (5.0 + 7.4 / SCALE, 5.0))
-    assert found.path_segments.num_rows == 8
-    assert found.totals.duration_s == pytest.approx(7.4 / velocity_mps(4, 0.0), rel=1e-4)
-
-
-def test_each_metre_has_the_class_under_it():
-    source = plane(classes=lambda east, _: np.where(east < 12.0, 4, 7))
-    found = _cost(source, (4.0, 12.0), (20.0, 12.0)).path_segments
-    assert found.column("terrain_name").to_pylist()[:7] == ["grass"] * 7
-    assert found.column("terrain_class").to_pylist()[-4:] == [7] * 4
-    assert found.column("course_rad").to_numpy() == pytest.approx(0.0, abs=1e-4)
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

@@ -132,16 +132,6 @@ def test_without_a_cost_map_the_cells_of_short_paths_are_predicted_and_the_plan_
     np.testing.assert_array_equal(found.xy_m, other.xy_m)
 
 
-def test_the_ellipse_grows_while_there_is_no_path():
-    """The only gap of a wall is far from the straight line."""
-    source = plane(
-        60.0, classes=lambda east, north: np.where((np.abs(east - 30.0) < 1.5) & (north < 52.0), 2, 4), pixel_size_m=0.2
-    )
-    found = _plan(source, (24.0, 6.0), (36.0, 6.0), "distance", model=replace(MODEL, patch_px=8))
-    assert found.totals.complete
-    assert found.totals.length_m > 6.0 * 12.0
-
-
 def test_ends_that_cannot_be_used_are_named_together():
     source = plane(30.0, classes=_wall)
     with pytest.raises(PathError) as error:

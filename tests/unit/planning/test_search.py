@@ -16,10 +16,8 @@ from tcpipe.planning.cost_grid import (
     MOVES,
     CostGrid,
     find_crossed_cells,
-    make_survey,
 )
 from tcpipe.planning.path_cost import compute_path_cost
-from tcpipe.planning.plan import plan_path
 from tcpipe.planning.search import (
     Turning,
     find_best_potential,
@@ -199,39 +197,9 @@ def test_a_corner_costs_its_angle_on_the_ground_where_it_is():
     assert with_turns.totals.duration_s == without.totals.duration_s
 
 
-def test_a_straight_path_and_one_of_jitter_cost_nothing_more():
-    source, fit = plane(), physics(all=264.0)
-    assert cost(source, (3.0, 3.0), (20.0, 15.0), fit=fit).totals.turn_energy_joule == 0.0
-    x = np.linspace(3.0, 20.0, 171)
-    jitter = np.column_stack([x, 8.0 + 0.004 * np.random.default_rng(0).standard_normal(171)])
-    assert cost(source, *jitter, fit=fit).totals.turn_energy_joule < 1.0
-
-
 def test_without_physics_nothing_is_said_of_turns():
     found = cost(plane(), *CORNER)
     assert found.totals.turn_energy_joule is None
     assert found.path_segments["turn_energy_joule"].null_count == found.path_segments.num_rows
     assert find_turning(None, PAPER_CLASSES) is None
     assert find_turning(physics(), PAPER_CLASSES) is None
-
-
-def slalom(east, north):
-    """Cheap grass in a zigzag through paved ground that costs more."""
-    return np.where(np.abs(north - 12.0 - 5.0 * np.sign(np.sin(east * 0.7)) * 0.5) < 2.0, 4, 5)
-
-
-def test_a_plan_that_pays_for_turns_turns_less():
-    source = plane(30.0, classes=slalom)
-    found = {}
-    for name, fit in (("free", None), ("dear", physics(all=2000.0))):
-        model = replace(PhysicsModel(), physics=fit)
-        ends = lonlat(source, (2.0, 12.0), (28.0, 12.0))
-        found[name] = plan_path(make_survey(model, source, 1.0), ends[0], ends[1], "energy")
-    assert found["dear"].totals.turn_rad <= found["free"].totals.turn_rad
-    # Judged alike, turns included, the plan that knew of them is no dearer.
-    lines = {name: plan.lonlat_deg for name, plan in found.items()}
-    judge = replace(PhysicsModel(), physics=physics(all=2000.0))
-    paid = {
-        name: compute_path_cost(judge, source, line, where="plan").totals.energy_joule for name, line in lines.items()
-    }
-    assert paid["dear"] <= paid["free"] * 1.001

@@ -1,7 +1,5 @@
 """The audit of the power sensor, against batteries whose resistance and currents are known."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
 
@@ -67,23 +65,6 @@ def test_two_drives_on_one_battery_are_judged_together():
         for name, of in (("left", amp), ("right", other))
     ]
     assert find_gain_change(measure_sag(rails)).ratio == pytest.approx(1.1, abs=0.02)
-
-
-def test_readings_of_1970_cost_no_memory_and_move_no_change():
-    """A computer without a battery clock begins in 1970, and gets the time a few readings later."""
-    amp, early = make_current(1), np.arange(5) * 50_000_000
-    rail = record(amp, gain=np.where(T > 160, 1.1, 1.0))
-    late = [
-        make_samples(np.append(early, STAMPS), np.append(each.value[:5], each.value))
-        for each in (rail.voltage, rail.current)
-    ]
-    tracemalloc.start()
-    found = find_gain_change(measure_sag([make_rail("drive", *late, averaged=False)]))
-    peak_bytes = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    wanted = find_gain_change(measure_sag([rail]))
-    assert (found.at_ns, found.ratio) == (wanted.at_ns, pytest.approx(wanted.ratio, rel=1e-3))
-    assert peak_bytes < 10_000_000
 
 
 def cut(amp):

@@ -5,7 +5,6 @@ import pytest
 from made_tracks import stamps
 
 from tcpipe.power.rails import (
-    compute_power_watt,
     count_samples_inside,
     estimate_idle_power,
     integrate_energy,
@@ -48,15 +47,6 @@ def test_energy_is_unknown_where_a_rail_is():
         [120 + 60]
     )
     assert np.isnan(integrate_energy([], seconds(0.5), seconds(1.5), rule="exact")).all()
-
-
-def test_a_rail_whose_signals_never_overlap_has_no_energy():
-    apart = make_rail(
-        "x", make_samples(seconds(0, 1), np.ones(2)), make_samples(seconds(2, 3), np.ones(2)), averaged=False
-    )
-    assert len(apart.stamp_ns) == 0
-    assert np.isnan(integrate_energy([apart], seconds(0.5), seconds(2.5), rule="exact")).all()
-    assert np.isnan(compute_power_watt([apart], seconds(1.0))).all()
 
 
 def test_samples_inside_are_counted_and_averaged():

@@ -104,13 +104,6 @@ def test_rows_of_a_table_may_hold_a_voltage_or_a_current():
     np.testing.assert_array_equal(np.isfinite(rail.current_amp), ~at_voltage)
 
 
-def test_a_power_without_a_voltage_keeps_all_its_rows():
-    watt = VOLT * AMP
-    source = PowerSource("my_msgs/msg/Power", power="watt")
-    found = readings.read_power({"/p": (source.type, {"log_time_ns": TIME_NS, "watt": watt})}, [source])
-    np.testing.assert_array_equal(found.rails["/p"][0].current_amp, watt)
-
-
 @pytest.mark.parametrize("share", [0.01, 0.04])
 @pytest.mark.parametrize("spike", [lambda amp: 10 * amp, lambda amp: -30 * amp, lambda amp: 0 * amp + 327.67])
 @pytest.mark.parametrize("held", [1, 4, 20])

@@ -108,19 +108,6 @@ def test_clearpath_power_that_does_not_fit_the_platform_is_refused() -> None:
     assert unknown.findings[0].names["platforms"] == "A200, A300, D100, J100, R100, W200"
 
 
-@pytest.mark.parametrize(
-    ("type_name", "fields"),
-    [
-        ("jackal_msgs/msg/Status", {"measured_battery": VOLT, "drive_current": AMP, "total_current": 3 * AMP}),
-        ("warthog_msgs/msg/Status", {"measured_battery": VOLT, "current_battery": AMP, "current_computer": AMP}),
-    ],
-)
-def test_older_clearpath_status(type_name: str, fields: dict) -> None:
-    found = read_power({"/status": (type_name, TIMES | fields)}, "generic")
-    np.testing.assert_allclose(power_watt(found), VOLT * AMP, rtol=1e-14)
-    assert found.facts.averaged
-
-
 @pytest.mark.parametrize(("recorded", "signs"), [(AMP, ["drawn_positive"]), (-AMP, [])])
 def test_the_sign_of_a_battery_is_told_by_its_mean(recorded: np.ndarray, signs: list[str]) -> None:
     found = read_power({"/battery": (BATTERY_STATE, battery(VOLT, recorded))}, "generic")
@@ -275,14 +262,6 @@ def test_a_row_beside_a_hole_does_not_tell_the_sign(topic: tuple[str, str]) -> N
 
 def source(**said) -> PowerSource:
     return PowerSource("my_msgs/msg/Battery", **{"voltage": "v", "current": "i", **said})
-
-
-def test_of_several_tables_the_most_particular_that_fit_count() -> None:
-    columns = TIMES | {"v": VOLT, "i": AMP, "j": 2 * AMP}
-    known = [source(), source(platform="P", current="j"), source(topic="/rear", current="i + j")]
-    for topic, platform, factor in (("/a", None, 1), ("/a", "P", 2), ("/rear", None, 3), ("/rear", "Q", 3)):
-        found = readings.read_power({topic: (known[0].type, columns)}, known, platform=platform)
-        np.testing.assert_allclose(power_watt(found), factor * VOLT * AMP)
 
 
 def test_a_type_whose_drawn_current_is_negative_needs_no_recipe_line() -> None:

@@ -41,9 +41,9 @@ def repeated(reading_hz, *, step, jitter=0.0, seed=1):
     return value[last], np.flatnonzero(np.diff(last)) + 1
 
 
-@pytest.mark.parametrize("step", [0.01, 0.1, 0.5])
+@pytest.mark.parametrize("step", [0.01, 0.5])
 @pytest.mark.parametrize("jitter", [0.0, 0.1])
-@pytest.mark.parametrize("reading_hz", [0.5, 1.0, 3.0, 5.0, 8.0, 10.0])
+@pytest.mark.parametrize("reading_hz", [0.5, 3.0, 8.0, 10.0])
 def test_readings_are_found_at_the_first_message_that_holds_them(reading_hz, jitter, step):
     value, arrivals = repeated(reading_hz, step=step, jitter=jitter)
     rows = find_readings(AT_NS, value[:, None])
@@ -54,7 +54,7 @@ def test_readings_are_found_at_the_first_message_that_holds_them(reading_hz, jit
     assert aside.max() <= max(1.0, 0.3 * 20 / reading_hz)
 
 
-@pytest.mark.parametrize("step", [0.02, 0.1, 0.3, 1.0, 2.0])
+@pytest.mark.parametrize("step", [0.02, 0.3, 2.0])
 @pytest.mark.parametrize("rows", [1, 10, 100, 1000])
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_a_coarse_signal_is_no_repeated_one(rows, step, noise):
@@ -66,7 +66,7 @@ def test_a_coarse_signal_is_no_repeated_one(rows, step, noise):
 @pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.25, 0.5])
 def test_levels_that_change_at_irregular_times_are_no_repeated_readings(share):
     rng = np.random.default_rng(5)
-    for _ in range(20):
+    for _ in range(8):
         value = np.cumsum((rng.random(COUNT) < share) * rng.integers(-4, 5, COUNT)) * 0.1
         assert find_readings(AT_NS, value[:, None]) is None
 
@@ -127,7 +127,7 @@ def average_before(values, seconds):
     return (sums[20 * seconds :] - sums[: -20 * seconds]) / (20 * seconds)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("seconds", [2, 4, 8])
 def test_smoothing_is_found_with_its_width_and_what_it_hides(seed, seconds):
     motion, power = drive_by_formula(seed)
@@ -187,7 +187,7 @@ def find_delay_of(power, motion, delay_s, *, rate_hz=20.0):
     return find_delay(make_power_fit(late, AT_NS, motion, averaged=False, margin_s=DELAY_MARGIN_S))
 
 
-@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 20.0])
+@pytest.mark.parametrize("rate_hz", [1.0, 20.0])
 @pytest.mark.parametrize("delay_s", [-0.3, 0.0, 0.1, 0.36, 1.0])
 def test_a_delay_is_found_within_its_uncertainty(delay_s, rate_hz):
     for seed in range(3):

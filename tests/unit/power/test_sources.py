@@ -194,19 +194,6 @@ def test_a_current_at_the_end_of_its_range_is_found(sign):
     assert 100 < found.sum() < 1500
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_an_unsigned_current_that_idles_just_below_zero_is_not_at_the_end_of_its_range(scale):
-    drive = np.where(np.arange(2000) % 400 > 60, draw_currents(1, 0.0625)[:, 0], -0.0625) / scale
-    columns = {
-        "log_time_ns": AT_NS,
-        "v": np.full(2000, 24.0),
-        "i": np.where(drive < 0.0, drive + 4096.0 / scale, drive),
-    }
-    for wraps_amp in (4096.0, None):
-        (rail,) = read_rails(columns, [source(current_scale=scale, wraps_amp=wraps_amp)], "/b")
-        assert rail.unmeasured_count == 0
-
-
 def test_the_drives_of_one_side_alone_are_found():
     both = ("/left_drive/battery_state", "/right_drive/battery_state")
     assert find_lone_side(both) is None

@@ -91,16 +91,6 @@ def test_patches_are_those_of_the_samples_named(built, page):
     assert np.median(alike) < np.median(own)
 
 
-def test_runs_lead_to_their_pages_in_the_store_beside(built, page):
-    hrefs = [run["href"] for run in data_of(page)["runs"]]
-    assert all((built / href).parent.is_dir() for href in hrefs)
-    assert all(f'href="{href}"' in page for href in hrefs)
-    assert "../store/report.html" not in page
-    report(built.parent / "store", runs=False)
-    assert 'href="../store/report.html"' in render_dataset_report(built, built.parent)
-    (built.parent / "store/report.html").unlink()
-
-
 def test_the_same_dataset_has_the_same_page(built, page):
     assert not report(built)[0].changed
     assert page.startswith(render_dataset_report(built, built.parent))

@@ -124,23 +124,6 @@ def test_a_remedy_is_the_lines_of_a_recipe_and_without_one_the_catalogue_advises
     assert line.remedies == [(read_catalogue()["lost-gap"].advice, [])]
 
 
-def test_only_columns_of_numbers_are_aligned_to_the_right():
-    columns = {
-        "13": ["0.4", ""],
-        "3.8 %": ["none", "0.1 %"],
-        "-0.9 ± 0.2 °": ["a", "b"],
-        "+12 ms": ["-3 ms", "4 ms"],
-        "0.81 (0.70 to 0.95)": ["–", "1.2"],
-        "0.061 s, 3.4 %": ["21.5 J, 10.8 %", "1.0 J, nan %"],
-        "2024-05-01-13-05-22-0e596a83": ["2", "3"],  # names of runs
-        "87f31f5a": ["1", "2"],
-        7: [1, 0],
-    }
-    section = PageSection("s", rows=list(zip(*([first, *rest] for first, rest in columns.items()), strict=True)))
-    right = [first for first, is_right in zip(columns, section.list_number_columns(), strict=True) if is_right]
-    assert right == ["13", "3.8 %", "+12 ms", "0.81 (0.70 to 0.95)", "0.061 s, 3.4 %", 7]
-
-
 def test_parts_without_figures_are_folded_and_long_texts_from_the_second_line():
     plot = make_plot("small", alt="small", axes=("x", "y"))
     plot.figure.line([0.0, 1.0], [0.0, 1.0])

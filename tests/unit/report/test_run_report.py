@@ -1,27 +1,22 @@
 """The page of a run of which only its store is known: what is thinned keeps its peaks, times survive clocks that step, lacks are said."""
 
-from dataclasses import replace
-
 import numpy as np
 import pyarrow as pa
 import pytest
 from page_reading import data_of, unpacked
 from synthetic_store import add_run, driven, lanes, segments
 
-from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.report.maps import StoredMaps
 from tcpipe.report.run_plots import (
     downsample_columns,
-    find_finding_spans,
     find_mask_spans,
     make_rail_series,
     make_timeline,
-    time_plots,
 )
 from tcpipe.report.run_report import run_report
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Subject, make_finding
-from tcpipe.tables.levels import POWER, REJECTIONS
+from tcpipe.tables.levels import POWER
 
 EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e\"'&"
 
@@ -59,14 +54,6 @@ def test_thinning_keeps_every_peak_and_says_how_many_there_were():
     shown = downsample_columns("x", np.arange(5.0), {"y": (2, short)})
     assert shown.columns["y"][1] == pytest.approx(short, nan_ok=True)
     assert len(shown.t_s) == 5
-
-
-def stepped(track, by_ns):
-    """The track with its second half an clock_epoch later, its stamps ``by_ns`` off."""
-    half, rows = track.num_rows // 2, np.arange(track.num_rows)
-    stamps = track.column("stamp_ns").to_numpy() + np.where(rows >= half, by_ns, 0)
-    track = track.set_column(0, track.schema.field("stamp_ns"), pa.array(stamps))
-    return track.set_column(1, track.schema.field("clock_epoch"), pa.array((rows >= half).astype(np.int16))), half
 
 
 def test_a_span_ends_where_the_reason_or_the_track_does():
@@ -114,20 +101,3 @@ def test_a_run_without_track_or_segments_is_a_page_too(tmp_path):
     assert "No track: the log has no measurements that can be fused." in html
     assert "no segments from 12 m driven; largest loss: gap, 12 m" in html
     assert "<td>gap</td>" in html
-
-
-def test_a_step_of_the_clock_has_its_place_and_its_size():
-    track, half = stepped(driven(drive()), 10**12)
-    axis = make_timeline(track)
-    at_s = half * 0.05 + 1000.0  # of stamps
-    step = make_finding(
-        "clock-step", Subject("log", "clock"), span_s=(at_s, at_s), names={"topics": "/gnss"}, step_s=1000.0, at_s=at_s
-    )
-    found = find_finding_spans([step, replace(step, severity="note")], track, axis)
-    spans, rejections = find_mask_spans(track, axis, 20.0), REJECTIONS.empty()
-    plots, _ = time_plots(axis, lines=[], spans=spans, rejections=rejections, has_labels=False, findings=found)
-    (event,) = [drawn.data_source.data for drawn in plots[0].figure.renderers if "text" in drawn.data_source.data]
-    assert event["row"] == ("clock-step",)
-    assert event["text"] == (describe_finding(step),)
-    assert event["left"][0] == pytest.approx((half - 1) * 0.05 + 1.0)
-    assert event["left"][0] < event["right"][0]

@@ -175,21 +175,6 @@ def test_a_run_that_cannot_be_read_is_named_and_costs_no_other_page(tmp_path):
     assert {row["run"]: row["state"] for row in shown(store)[3]} == {"a": "current", "b": "tables missing"}
 
 
-def test_the_current_runs_are_those_of_the_ruling_recipe_however_few(tmp_path):
-    store = open_store(tmp_path / "store", create=True)
-    for number, run_id in enumerate("abc"):
-        add(store, run_id, number, recipe=OLD)
-    add(store, "a", 0)
-    assert {(row["run"], row["state"]) for row in shown(store)[3]} == {
-        ("a", "current"), *((run_id, "of another recipe") for run_id in "abc")
-    }  # fmt: skip
-    report(store.root, runs=False, recipe=OLD)
-    rows = read_rows(store)[2]
-    assert sorted(row["state"] for row in rows) == ["current"] * 3 + ["of another recipe"]
-    report(store.root, runs=False, recipe=replace(Recipe(), read=ReadConfig(ignore_topics=["/other"])))
-    assert "The store has no runs of the current recipe." in read_rows(store)[0]
-
-
 def test_a_page_is_rendered_again_only_where_its_inputs_have_changed(tmp_path, monkeypatch):
     store = open_world(tmp_path)
     for number, run_id in enumerate("ab"):

@@ -20,7 +20,6 @@ from tcpipe.simulation.sensors import (
     Gnss,
     Noise,
     Sensors,
-    Visual,
     record,
 )
 from tcpipe.tables.columns import to_floats, to_integers
@@ -85,22 +84,6 @@ def test_lever_arm_and_mounting_turn_with_the_robot(truth):
     np.testing.assert_allclose(felt[:, 2], GRAVITY_MPS2, atol=1e-5)
 
 
-def test_camera_twist_is_the_motion_of_its_own_place(truth):
-    visual = readings(truth)["visual"]
-    before, after = truth.at(visual.stamp_ns - 5_000_000), truth.at(visual.stamp_ns + 5_000_000)
-    lever = np.array(Visual().mounting.xyz_m)
-    moved = (after.enu_m + Rotation.from_quat(after.quat_xyzw).apply(lever)) - (
-        before.enu_m + Rotation.from_quat(before.quat_xyzw).apply(lever)
-    )
-    enu_from_camera = Rotation.from_quat(truth.at(visual.stamp_ns).quat_xyzw) * Rotation.from_euler(
-        "xyz", Visual().mounting.rpy_rad
-    )
-    inner = slice(5, -5)
-    np.testing.assert_allclose(
-        visual.values["linear_mps"][inner], enu_from_camera.inv().apply(moved / 0.01)[inner], atol=0.01
-    )
-
-
 @pytest.mark.parametrize("name", [field.name for field in fields(Faults)])
 def test_each_fault_changes_its_sensor_alone(truth, exact, name):
     plain, faulty = exact, readings(truth, name)
@@ -116,12 +99,6 @@ def same(one, other):
         and np.array_equal(one.log_time_ns, other.log_time_ns)
         and all(np.array_equal(one.values[key], other.values[key], equal_nan=True) for key in one.values)
     )
-
-
-def test_a_fault_leaves_the_noise_of_others_as_it_was(truth):
-    alone = readings(truth, "gnss_noise")["gnss"]
-    both = readings(truth, "gnss_noise", "gnss_stamp_jitter", "imu_noise", "transport_delay")["gnss"]
-    np.testing.assert_array_equal(alone.values["lon_deg"], both.values["lon_deg"])
 
 
 def test_noise_is_as_strong_as_said(long_truth):

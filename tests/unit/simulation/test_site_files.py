@@ -1,7 +1,6 @@
 """The files of a simulated site, read back by rasterio, rosbags, mcap and json, never by our own readers."""
 
 import hashlib
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +10,9 @@ import rasterio
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from shapely.geometry import Point, shape
 
 from tcpipe.errors import UsageError
-from tcpipe.simulation import Faults, make_tiny, read_truth, simulate, simulate_readings
+from tcpipe.simulation import Faults, make_tiny, simulate, simulate_readings
 from tcpipe.simulation.scenarios import HUSKY_ROS1, HUSKY_ROS2, RasterSpec, make_small_world
 
 
@@ -78,23 +76,6 @@ def test_rasters_equal_the_world_at_their_pixel_centres(site):
                 assert (values[0][~mapped] == raster.nodata).all()
                 assert raster.colormap(1)[40] == (150, 200, 90, 255)
     assert len(grids) == 3, "no two share a grid"
-
-
-def test_region_is_geojson_in_wgs84_and_covers_a_part(site):
-    region = json.loads(site.region.read_text())
-    polygon = shape(region["features"][0]["geometry"])
-    truth = read_truth(site.truths[0])
-    assert polygon.contains(Point(truth.lon_deg[0], truth.lat_deg[0]))
-    assert not polygon.contains(
-        Point(*(value[0] for value in make_small_world().site.lonlat_deg(np.array([697715.0]), np.array([5208440.0]))))
-    )
-
-
-def test_truth_file_gives_the_truth_back(site):
-    kept = read_truth(site.truths[0])
-    truth, _ = simulate_readings(make_tiny(Faults.every(), seconds=20.0), seed=3)
-    for name in ("stamp_ns", "lon_deg", "quat_xyzw", "energy_joule", "terrain_class", "velocity_enu_mps"):
-        np.testing.assert_array_equal(getattr(kept, name), getattr(truth, name))
 
 
 def test_mcap_holds_the_readings(site):

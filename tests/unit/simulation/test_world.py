@@ -47,19 +47,6 @@ def test_classes_by_hand_and_later_regions_win():
     assert classes.tolist() == [PAVED, GRASS, PAVED, MUD, GRASS, PAVED]
 
 
-def test_the_sun_shades_by_the_angle_that_it_falls_in():
-    """Against the normal by differences of the height; level ground keeps its colour."""
-    sun = np.array([0.48, -0.36, 0.8])
-    lit, (x, y) = replace(make_small_world(), sun=tuple(sun.tolist())), places(200, seed=4)
-    east = (lit.height_m(x + 0.01, y) - lit.height_m(x - 0.01, y)) / 0.02
-    north = (lit.height_m(x, y + 0.01) - lit.height_m(x, y - 0.01)) / 0.02
-    normal = np.column_stack([-east, -north, np.ones(200)]) / np.sqrt(1 + east**2 + north**2)[:, None]
-    ratio = lit.ortho(x, y) / make_small_world().ortho(x, y)
-    np.testing.assert_allclose(ratio, np.repeat((normal @ sun / sun[2])[:, None], 3, axis=1), atol=1e-6)
-    assert ratio.min() < 0.9
-    assert ratio.max() > 1.1
-
-
 def test_grid_north_and_scale_are_the_projections():
     x, y = np.array([SITE.west_m + 60.0]), np.array([SITE.south_m + 40.0])
     scale, rotation = SITE.ground_from_map(x, y, np.zeros(1))

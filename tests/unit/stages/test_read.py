@@ -1,6 +1,5 @@
 """Logs made by hand become streams: every role, one clock, placed sensors, and everything that is missing said."""
 
-import tracemalloc
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -15,11 +14,9 @@ from scipy.spatial.transform import Rotation
 from tcpipe.errors import RecipeError, RoleError
 from tcpipe.formats.recipe_toml import load_shipped_profiles, parse_recipe, parse_toml
 from tcpipe.logs.topics import Topic
-from tcpipe.power.sources import RailReadings
 from tcpipe.recipe import Extrinsics, ReadConfig
 from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.stages.read import read_run
-from tcpipe.stages.read_power import select_power_rows
 from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import Streams
 
@@ -283,18 +280,6 @@ def test_of_two_topics_named_for_one_role_the_first_is_used_where_both_have_mess
     assert not select_findings(other.report.findings, "topic-overlaps")
 
 
-def test_two_frames_are_not_joined_unless_the_recipe_states_one_place() -> None:
-    log = renamed(200, until=200, child="camera")
-    found = read(log, topics={"wheel_odometry": ["/odom", "/platform/odom"]})
-    assert found.tables["wheel_odometry"].num_rows == 200
-    (unused,) = select_findings(found.report.findings, "topic-left-out")
-    assert (unused.subject.name, unused.names["reason"]) == ("/platform/odom", "another-frame")
-    placed = read(
-        log, topics={"wheel_odometry": ["/odom", "/platform/odom"]}, extrinsics={"wheel_odometry": Extrinsics()}
-    )
-    assert placed.tables["wheel_odometry"].num_rows == 500
-
-
 def test_topics_without_messages_play_no_part_even_where_the_index_cannot_tell() -> None:
     log = MemoryLog(
         {name: (kind, table.slice(0, 0)) for name, (kind, table) in husky().items()} | {"/odom": odometry()}
@@ -421,48 +406,6 @@ def test_a_step_of_all_clocks_divides_every_table() -> None:
     assert step.span_s == pytest.approx((5.0, 5.0), abs=0.1)
 
 
-def test_rows_of_power_that_carry_nothing_are_counted() -> None:
-    volt, amp = np.full(6, 26.0), np.full(6, 5.0)
-    volt[3] = amp[3] = amp[5] = np.nan
-    found = select_power_rows({"log_time_ns": np.arange(6)}, [RailReadings("battery", volt, amp)])
-    assert found.dropped == {"not_finite": 1}
-    assert found.row.tolist() == [0, 1, 2, 4, 5]
-
-
-def vesc(joule: np.ndarray, late_ns: np.ndarray) -> tuple[str, pa.Table]:
-    """A counter of energy whose messages are written down late by uneven times."""
-    table = message_table(len(joule), 20.0, **{"state.voltage_input": full(len(joule), 24.0)})
-    columns = {"state.energy_drawn": joule / 3600.0, "state.energy_regen": full(len(joule), 0.0)}
-    for name, values in columns.items():
-        table = table.append_column(name, pa.array(values))
-    late = pa.array(table["log_time_ns"].to_numpy() + late_ns)
-    return "vesc_msgs/msg/VescStateStamped", table.set_column(0, "log_time_ns", late)
-
-
-@pytest.mark.parametrize("stepped", [False, True])
-def test_a_counter_of_energy_is_power_by_the_stamps_that_rule(*, stepped: bool) -> None:
-    joule = np.cumsum(np.random.default_rng(3).uniform(3.0, 20.0, 200))
-    late_ns = np.random.default_rng(4).integers(0, 15_000_000, 200)
-    late_ns[100] = (
-        late_ns[101] + 49_990_000
-    )  # written down in a burst with the next: by the log's times that would be thousands of amperes
-    topics = {**husky(), "/sensors/core": vesc(joule, late_ns)}
-    del topics["/left/battery"], topics["/right/battery"]
-    if stepped:
-        topics = {name: (kind, with_step(table)) for name, (kind, table) in topics.items()}
-    found = read(topics)
-    table = found.tables["power"]
-    stamp_s, clock_epoch = table["stamp_ns"].to_numpy() / 1e9, table["clock_epoch"].to_numpy()
-    watt = table["voltage_volt"].to_numpy() * table["current_amp"].to_numpy(zero_copy_only=False)
-    first = np.flatnonzero(np.diff(clock_epoch, prepend=-1))
-    assert np.flatnonzero(np.isnan(watt)).tolist() == first.tolist()
-    assert len(first) == 1 + stepped
-    within = np.diff(clock_epoch) == 0
-    np.testing.assert_allclose((watt[1:] * np.diff(stamp_s))[within], np.diff(joule)[within], rtol=1e-5)
-    assert found.power_averaged
-    assert "power-values-excluded" not in codes(found)
-
-
 @pytest.mark.parametrize(("setting", "averaged", "severities"), [("auto", False, ["warning"]), ("yes", True, [])])
 def test_averaging_that_nobody_knows_and_no_motion_tells_is_asked(
     *, setting: str, averaged: bool, severities: list[str]
@@ -536,21 +479,6 @@ def test_a_pose_is_placed_by_its_crs_and_stands_in_for_the_fixes():
     for crs, said in (("EPSG:4326", "not projected"), ("MTM 7", "not a CRS")):
         with pytest.raises(RecipeError, match=said):
             read(topics, topics={"pose": ["/slam/pose"]}, pose_crs=crs)
-
-
-def test_reading_takes_room_for_little_more_than_its_tables() -> None:
-    """Twice as many messages take twice the tables, and at most 2.5 times that on the way; 0.8.0 took 3.5 times."""
-
-    def peak_and_tables(rows: int) -> tuple[int, int]:
-        log = MemoryLog({"/imu/data": imu(rows), "/husky_velocity_controller/odom": odometry(rows)})
-        tracemalloc.start()
-        found = read(log)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return peak, sum(table.nbytes for table in found.tables.values())
-
-    (short, of_short), (long, of_long) = peak_and_tables(10_000), peak_and_tables(20_000)
-    assert long - short <= 2.5 * (of_long - of_short)
 
 
 @pytest.mark.parametrize("sign", ["drawn_positive", "drawn_negative"])

@@ -3,7 +3,7 @@
 import numpy as np
 import pyproj
 import pytest
-from made_tracks import GRAZ, make_track, stamps, straight_track
+from made_tracks import GRAZ, straight_track
 
 from tcpipe.recipe import MaskConfig, SegmentConfig
 from tcpipe.stages.mask import mask_track
@@ -86,11 +86,3 @@ def test_a_run_without_segments_says_why_and_what_it_lost():
     assert why.names == {"reason": "reversing"}
     (lost,) = select_findings(segments.info.report.findings, "lost-reversing")
     assert lost.numbers["lost_fraction"] == pytest.approx(why.numbers["lost_m"] / why.numbers["driven_m"])
-
-
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_tiny_tracks_have_no_segments(count):
-    nothing = np.zeros((count, 3))
-    segments = cut(make_track(nothing, nothing, stamp_ns=stamps(count)))
-    assert segments.table.num_rows == 0
-    assert sum(segments.distance_by_reason_m.values()) == 0

@@ -138,15 +138,6 @@ def test_runs_of_another_recipe_are_left_out_and_named(store, tmp_path):
     assert (result.card.samples, result.exit_code) == (20, 3)
 
 
-def test_a_drive_in_two_logs_counts_once(store, tmp_path):
-    add(store, start_ns=10**18, fixes={})
-    add(store, "b", start_ns=10**18 + 300_000_000, fixes={"late_ns": 300_000_000})
-    result = build(store, tmp_path)
-    assert result.card.samples == 20
-    assert twice(result) == [("b", "a", 20, 20)]
-    assert [run.run_id for run in result.card.runs] == ["a"]
-
-
 @pytest.mark.parametrize(("names", "skew_ns"), [(("a", "b"), 0), (("b", "a"), 300_000_000), (("a", "b"), -900_000_000)])
 def test_a_recording_that_overlaps_another_counts_once_where_it_does(store, tmp_path, names, skew_ns):
     """One drive of 40 m; its second recording has the last 20 m of the first one and 10 m more."""
@@ -173,15 +164,6 @@ def test_a_drive_that_was_recorded_in_two_pieces_is_one_and_a_short_one_after_it
 
 
 OTHER_TOPIC = {"drive": 1, "topic": "/gps/fix"}
-
-
-def test_two_robots_that_drive_together_keep_all_their_segments(store, tmp_path):
-    add(store, start_ns=10**18, fixes={})
-    add(store, "b", (1.5,), start_ns=10**18 + 200_000_000, fixes={"drive": 1})
-    result = build(store, tmp_path)
-    assert result.card.samples == 40
-    assert twice(result) == []
-    assert select_findings(result.findings, "drives-overlap") == []
 
 
 @pytest.mark.parametrize("fixes", [OTHER_TOPIC, None])
@@ -221,18 +203,6 @@ def test_the_card_says_what_the_power_of_any_run_feeds(store, tmp_path):
         add_run(store, run_id, segments(run_id, *lanes(y_m, -10.0, 10.0)), includes=(what,))
     build(store, tmp_path)
     assert open_dataset(tmp_path / "out").card.label.includes == ("computers", "user ports")
-
-
-def test_beside_runs_with_power_one_without_gives_no_sample(store, tmp_path):
-    add(store, powered=False)
-    assert "none with power" in refused(store, tmp_path, labels="energy")
-    add(store, "b", (3.0,))
-    result = build(store, tmp_path, page=True)
-    assert result.card.samples == 20
-    assert result.card.distance_by_reason_m["no_power"] == pytest.approx(20)
-    (found,) = select_findings(result.findings, "run-without-samples")
-    assert (found.subject, found.names) == (Subject("run", "a"), {"lacks": "power"})
-    assert sum(result.card.distance_by_reason_m.values()) == pytest.approx(45)
 
 
 def test_a_map_that_does_not_cover_the_runs(store, tmp_path):
@@ -297,14 +267,6 @@ def test_an_exclude_region_takes_samples_out_of_the_dataset(store, tmp_path):
     assert result.card.samples == 10
 
 
-def test_a_dataset_that_lost_a_file_is_built_again(store, tmp_path):
-    add(store)
-    build(store, tmp_path)
-    (tmp_path / "out" / "samples.parquet").unlink()
-    assert build(store, tmp_path).status == "done"
-    assert (tmp_path / "out" / "samples.parquet").exists()
-
-
 def test_holdout_and_seed_overrule_the_recipe(store, tmp_path):
     add(store)
     sample = build(store, tmp_path, holdout="sample")
@@ -331,13 +293,6 @@ def test_what_the_call_says_instead_of_the_recipe_is_checked_as_the_recipe_is(st
         build(store, tmp_path, holdout="samples")
     with pytest.raises(UsageError, match="seed is -1; expected a number from 0"):
         build(store, tmp_path, seed=-1)
-
-
-def test_a_place_that_cannot_be_written(store, tmp_path):
-    add(store)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="cannot be written"):
-        build_dataset(tmp_path / "file" / "out", store=store.root, recipe=Recipe())
 
 
 @pytest.mark.parametrize("limit_bytes", [10_000, 40_000, 70_000])

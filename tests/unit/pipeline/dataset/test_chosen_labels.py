@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from synthetic_store import add_run, add_world, box, driven, lanes, open_world, region_file, segments
+from synthetic_store import add_run, box, driven, lanes, open_world, region_file, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
@@ -21,8 +21,6 @@ from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import select_findings
-
-DRAWS_DATASET_PAGES = True
 
 
 def with_null(table, *names, rows=slice(None)):
@@ -93,6 +91,7 @@ def test_runs_without_power_give_the_samples_splits_and_times_of_runs_with_it(st
     assert result.card.labels == {"energy": 0, "time": 112, "slip": 112, "vibration": 112}
     (absent,) = select_findings(result.card.findings, "labels-absent")
     assert absent.names["labels"] == "energy"
+    report(tmp_path / "without")
     assert "none" in (tmp_path / "without" / "report.html").read_text()
     assert not verify(tmp_path / "without").problems
 
@@ -148,20 +147,6 @@ def test_without_a_map_the_dataset_is_a_table_with_the_same_split(store, bare, t
         with pytest.raises(DatasetError, match=r"has no patches; .*add-map"):
             refused()
     assert not verify(tmp_path / "without").problems
-
-
-def test_the_first_map_of_a_store_gives_its_datasets_patches_unless_they_were_declined(bare, tmp_path):
-    add_run(bare, "a", make_segments("a", [1.0]))
-    assert build(bare, tmp_path / "out").card.layers == {}
-    declined = build(bare, tmp_path / "declined", without_patches=True)
-    assert not select_findings(declined.card.findings, "no-map")
-    add_world(bare)
-    assert set(build(bare, tmp_path / "out").card.layers) == {"ortho", "terrain", "height"}
-    assert build(bare, tmp_path / "declined", without_patches=True).status == "unchanged"
-    with pytest.raises(UsageError, match="--without-patches: yes in the dataset, no now"):
-        build(bare, tmp_path / "declined")
-    with pytest.raises(UsageError, match="--map, --without-patches"):
-        build(bare, tmp_path / "other", map="site", without_patches=True)
 
 
 def test_runs_without_gnss_are_split_and_audited_each_in_its_own_frame(bare, tmp_path, region):

@@ -137,33 +137,6 @@ def test_batches_from_a_bucket_are_those_from_disk_and_are_fetched_once(made, bu
     assert {name.rpartition("/")[2] for name in bucket[1][fetched:]} <= {"dataset.json", "report.html"}
 
 
-def test_of_a_sample_only_its_chunks_are_fetched(made, bucket):
-    put(made, bucket)
-    split = tcpipe.open_dataset(URL)["train"]
-    before = bucket[1].sent_bytes
-    piece = split.view.stored.files.read(0, ["height"])
-    shard = bucket[0] / "by name" / "ds" / "patches.zarr" / "height" / "c" / "0" / "0" / "0"
-    assert piece["height"].shape[1:] == (40, 40)
-    whole = shard.stat().st_size
-    assert whole < bucket[1].sent_bytes - before < 1.9 * whole, "its digest once, then the piece"
-    before = bucket[1].sent_bytes
-    tcpipe.open_dataset(URL)["train"].view.stored.files.read(1, ["height"])
-    assert bucket[1].sent_bytes - before < 0.9 * whole, "its ETag tells that it is as it was"
-
-
-def test_what_the_cache_holds_is_proved_and_fetched_anew_where_it_was_altered(made, bucket, tmp_path):
-    put(made, bucket)
-    wanted = tcpipe.open_dataset(made / "zarr")["train"].patches
-    assert np.array_equal(tcpipe.open_dataset(URL)["train"].patches, wanted)
-    for path in (tmp_path / "cache").rglob("*"):
-        if path.is_file():
-            data = bytearray(path.read_bytes())
-            data[len(data) // 2] ^= 0xFF
-            path.unlink()
-            path.write_bytes(data)
-    assert np.array_equal(tcpipe.open_dataset(f"{URL}/")["train"].patches, wanted)
-
-
 def test_what_is_altered_in_the_bucket_is_no_patch(made, bucket):
     put(made, bucket)
     for path in (bucket[0] / "by name" / "ds" / "patches.zarr" / "height" / "c").rglob("0"):

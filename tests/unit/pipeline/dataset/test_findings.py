@@ -14,11 +14,10 @@ from tcpipe.formats.dataset_card import RunSource, group_dataset_findings, judge
 from tcpipe.formats.finding_lines import format_groups
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.card import count_flagged
+from tcpipe.pipeline.report import report
 from tcpipe.recipe import Recipe
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.findings import Subject, make_finding, select_findings
-
-DRAWS_DATASET_PAGES = True
 
 ROLE = Subject("role", "command")
 
@@ -90,7 +89,9 @@ def built(tmp_path_factory):
         table = segments(run_id, *lanes([4.0 * number], -10.0, 10.0), start_ns=number * 10**12)
         bits = np.where(np.arange(table.num_rows) < 5 * number, int(Quality.WEAK_GNSS), 0) | int(Quality.NO_COMMAND)
         add_run(store, run_id, with_columns(table, quality=bits), findings=(slow(0.1 * number + 0.6),))
-    return build_dataset(directory / "out", store=store.root, recipe=Recipe()), directory / "out"
+    result = build_dataset(directory / "out", store=store.root, recipe=Recipe())
+    report(directory / "out")
+    return result, directory / "out"
 
 
 def test_they_stand_in_the_commands_answer_the_card_and_what_is_opened(built):

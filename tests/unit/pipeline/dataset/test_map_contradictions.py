@@ -128,7 +128,7 @@ def dig(depth_m, radius_m=0.35):
 
 
 FAULTS = {
-    **{f"step of {step} m": raise_beyond(step) for step in (0.1, 0.2, 0.35, 1.0)},
+    **{f"step of {step} m": raise_beyond(step) for step in (0.1, 1.0)},
     "step along the lanes": raise_beyond(0.35, (0.0, 1.0)),
     "holes of 0": lambda x, y, z: np.where(dig(1.0)(x, y, z) == z, z, 0.0),
     "pits": dig(0.5),

@@ -10,8 +10,6 @@ from synthetic_store import add_run, box, lanes, open_world, region_file, segmen
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 
-DRAWS_DATASET_PAGES = True
-
 CLOSED = box(-19, -19, -5, 19)
 NOISE_WATT = 7.0
 

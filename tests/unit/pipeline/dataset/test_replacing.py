@@ -2,12 +2,9 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from object_gateway import in_environment
-from storage_server import object_store
 from stored_files import read_files as tree
 from synthetic_store import add_run, add_world, box, lanes, region_file, segments
 
@@ -66,8 +63,6 @@ OTHER = {
     "map": ("yard", "--map: site in the dataset, yard now"),
     "tag": ({}, "--tag: weather=dry in the dataset, none now"),
     "format": ("parquet", "--format: zarr in the dataset, parquet now"),
-    "seed": (5, "recipe split.seed: 0 in the dataset, 5 now"),
-    "holdout": ("sample", "recipe split.holdout: block in the dataset, sample now"),
     "without_coordinates": (True, "--without-coordinates: no in the dataset, yes now"),
     "recipe": (
         Recipe(sample=SampleConfig(patch_px=20), dataset=DatasetConfig(licence="CC0-1.0")),
@@ -140,7 +135,6 @@ CAUSES = {
     ("run: added wet", "chosen tags: weather dry → none")),
     "order of maps": ({"map": ["site", "yard"]}, {"map": ["yard", "site"]}, ("order of maps: site, yard → yard, site",)),
     "map": ({"map": "site"}, {"map": "yard"}, ("map: added yard", "map: removed site", "order of maps: site → yard")),
-    "region": ({"split": "region.geojson"}, {"split": "other.geojson"}, ("region: train_test is another one",)),
 }  # fmt: skip
 
 
@@ -220,23 +214,6 @@ def test_what_is_no_dataset_is_left_alone_with_force_too(here, force):
         assert tree(here / "folder") == before
 
 
-def test_in_a_bucket_the_differences_are_named_too_and_force_builds_beside_it(here, monkeypatch):
-    (here / "served" / "sets").mkdir(parents=True)
-    shutil.copytree(here / "dataset", here / "served" / "sets" / "ds")
-    with object_store(here / "served") as (environment, _):
-        in_environment(monkeypatch, environment, here / "cache")
-        with pytest.raises(UsageError) as caught:
-            build_dataset("s3://sets/ds", **usual(here, map="yard"))
-        assert "was made with other options and is not changed" in caught.value.problems[0]
-        assert caught.value.problems[1:] == (f"s3://sets/ds: {OTHER['map'][1]}",)
-        assert build_dataset("s3://sets/ds", **usual(here)).status == "unchanged"
-        assert tree(here / "served" / "sets" / "ds") == tree(here / "dataset")
-        assert build_dataset("s3://sets/ds", **usual(here, map="yard", force=True)).status == "done"
-        build_dataset(here / "dataset", **usual(here, map="yard", force=True))
-        (build,) = (here / "served" / "sets" / "ds" / "builds").iterdir()
-        assert read_card(build) == read_card(here / "dataset")
-
-
 def test_what_another_call_builds_there_meanwhile_stays(here, monkeypatch):
     out, draw = here / "dataset", writing.write_patches
 
@@ -250,9 +227,3 @@ def test_what_another_call_builds_there_meanwhile_stays(here, monkeypatch):
     with pytest.raises(StoreError, match="another call has built a dataset here meanwhile and it is kept"):
         build_dataset(out, **usual(here))
     assert [entry.name for entry in read_card(out).maps] == ["yard"]
-
-
-def test_the_options_are_compared_as_data_and_not_by_how_they_are_written(here):
-    same = replace(Recipe(), sample=SampleConfig(patch_px=40))
-    assert build_dataset(here / "dataset", **usual(here, recipe=same, robot="husky")).status == "unchanged"
-    assert build_dataset(here / "dataset", **usual(here, tag={"weather": "dry"}, min_runs=1)).status == "unchanged"
