@@ -1,9 +1,8 @@
-"""The one way to compile a numeric kernel: numba, cached on disk, and said aloud when it really compiles.
+"""Compilation of numeric kernels by numba, with a cache on disk.
 
-Compilation takes seconds, once; the listener reports it through the logger ``tcpipe`` so that nobody thinks the program hangs.
-A read-only installation without a home directory has no place for numba's cache: a temporary directory is used then.
-Numba takes a cached kernel for fresh as long as the kernel's own file is the same, whatever has changed in other modules that it calls:
-here it is fresh only if what the file imports is the same, too.
+The first compilation takes seconds, so a listener reports it through the logger ``tcpipe``: the program does not hang. If an
+installation is read-only and has no home directory, the cache is a temporary directory. Numba compares only the kernel's own file with
+its cache; tcpipe also compares what this file imports.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _Key = TypeVar("_Key")
 
 
 class _Announce(event.Listener):  # type: ignore[misc]
-    """Says once that kernels are being compiled, when the first one is."""
+    """Listener that reports the first compilation of a kernel."""
 
     def __init__(self) -> None:
         self.said = False
@@ -42,7 +41,7 @@ class _Announce(event.Listener):  # type: ignore[misc]
             logger.info("compiling numeric kernels: some seconds, once; they are cached for later runs")
 
     def on_end(self, event: Any) -> None:
-        """Nothing to say at the end."""
+        """Ignore the end of a compilation."""
 
 
 event.register("numba:compile", _Announce())
@@ -53,9 +52,9 @@ _load = CPUContext.load_additional_registries
 
 
 def _load_without_blas(context: CPUContext) -> None:
-    """Load what numba needs, in a process of our own without scipy's linear algebra: it only looks whether that is there, for 0.2 s.
+    """Load what numba needs, in the command line without scipy's linear algebra, whose import takes 0.2 s.
 
-    A kernel that multiplies matrices would be refused. Who uses tcpipe as a library may have such.
+    Numba would reject a kernel that multiplies matrices. Programs that import tcpipe may have such kernels, so they load it.
     """
     if "tcpipe.cli" not in sys.modules or _BLAS in sys.modules:
         _load(context)
@@ -94,10 +93,10 @@ def _load_overloads(load: Callable[[], dict[_Key, str]]) -> dict[_Key, str]:
 
 
 def _stamp(source: bytes, function: Callable[..., Any]) -> str:
-    """Return what a cached kernel must have been made of to be used: its file, and all that its module imports and numba compiles in.
+    """Return the checksum of a kernel's inputs: its file, and the imported values that numba compiles into it.
 
-    That are numbers and text, kernels (whose own stamp holds what they are made of) and the fields of named tuples. What the module
-    defines itself is in its file; so it need not be told apart here.
+    These values are numbers and text, other kernels (by their own stamps) and the fields of named tuples. Values that the module
+    defines are in its file.
     """
     made_of = [repr(source)]
     for name, value in sorted(function.__globals__.items()):
@@ -111,19 +110,19 @@ def _stamp(source: bytes, function: Callable[..., Any]) -> str:
 
 
 def _index_of(compiled: Any) -> Any:
-    """Return the index of what numba has cached of a kernel."""
+    """Return numba's index of the cached overloads of a kernel."""
     return compiled._cache._cache_file  # noqa: SLF001
 
 
 def _is_plain(value: object) -> bool:
-    """Whether a value is a number, a text or a tuple of such: what numba compiles in as it is, and what ``repr`` tells wholly."""
+    """Return whether numba compiles a value in as a constant, and ``repr`` shows all of it: a number, a text or a tuple of these."""
     return all(map(_is_plain, value)) if isinstance(value, tuple) else isinstance(value, Number | str)
 
 
 def _cache_directory(compiled: str = "") -> str:
-    """Return a temporary directory that nobody else can write to: numba executes what it finds there.
+    """Return a temporary directory that only this user can write to, because numba executes its files.
 
-    It begins with what was ``compiled`` before, in a directory that cannot be written to: numba reads none of such.
+    It begins with a copy of ``compiled``, a cache that cannot be written to, because numba does not read such a cache.
     """
     directory = f"{tempfile.gettempdir()}/tcpipe-kernels-{os.getuid()}"
     if not os.path.lexists(directory):

@@ -12,7 +12,7 @@ from typing import Any
 
 _URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]+:/{1,2})(\S+)", re.IGNORECASE)
 _CLOSING = ")]}'\",;:."
-"""What may follow a URL in a sentence."""
+"""Characters that may follow a URL in a sentence."""
 
 
 def hide_secrets(text: str) -> str:
@@ -134,7 +134,7 @@ class ModelError(TcpipeError):
 
 
 class PathError(TcpipeError):
-    """A path cannot be used, or there is none."""
+    """A planned path cannot be used, or no path exists."""
 
 
 class TableError(TcpipeError):

@@ -96,7 +96,7 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
         )
     if len(twice := rows[_STAMP].filter(rows[_STAMP].is_duplicated())):
         raise DatasetError(
-            f"{path}: rows of {_format_utc(twice[0])} differ from one another; expected one row a stamp: one station, one depth a file"
+            f"{path}: rows of {_format_utc(twice[0])} differ; expected one row per stamp: split the table by station and depth"
         )
     return CovariateTable(path.name, compute_checksum(path), column, rows, tuple(findings))
 

@@ -72,7 +72,7 @@ def _check_headers(stream: BinaryIO, size: int) -> None:
                 if dtype.hasobject or min(shape, default=0) < 0:
                     raise ValueError(f"{member.filename[:80]!r} contains no numbers")
                 if array.tell() + dtype.itemsize * math.prod(shape) != member.file_size:
-                    raise ValueError(f"{member.filename[:80]!r} claims {shape} of {dtype}, which its bytes are not")
+                    raise ValueError(f"{member.filename[:80]!r} states {shape} of {dtype}, but has another size")
             names.add(member.filename)
     if len(names) != len(members):
         raise ValueError("two arrays of one name")

@@ -103,7 +103,7 @@ class ResNet18(nn.Module):
 
     @classmethod
     def from_arrays(cls, depth: int, outputs: int, width: int, *, arrays: Arrays) -> ResNet18:
-        """Return a network of these sizes with its weights; `ModelError` if they are another's, before memory is taken."""
+        """Return a network of these sizes with its weights; `ModelError`, before memory is allocated, if the weights have other sizes."""
         with torch.device("meta"):
             network = cls(depth, outputs, width)
         network.load(arrays)

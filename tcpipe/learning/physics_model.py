@@ -157,7 +157,7 @@ class Curves:
     """Coefficients of each of these classes, shape (classes, J, outputs)."""
 
     def predict(self, slope_rad: Floats, class_id: Ints) -> Floats:
-        """Return outputs, shape (N, outputs), of metres of ground."""
+        """Return outputs, shape (N, outputs), of segments of one metre by slope and class."""
         made = _evaluate_functions(self.knots_rad, slope_rad)
         out = made @ self.pooled
         for known, numbers in zip(self.class_id.tolist(), self.own, strict=True):

@@ -463,7 +463,7 @@ def _sort_power(decided: _Decisions, topic: Topic) -> Sorted:
 
 
 def _find_bare_power(decided: _Decisions, topics: Iterable[Topic]) -> Ranked:
-    """Return bare numbers that make whole rails: one voltage and one current that are called alike, on drives or batteries."""
+    """Return bare numbers that form power rails: one voltage and one current of drives or batteries whose topics have like names."""
     rails: dict[str, list[Topic]] = {}
     for topic in topics:
         if find_quantity(topic.name) is not None and re.search(r"drive|motor|traction|batter", topic.name.lower()):

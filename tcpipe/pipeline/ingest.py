@@ -94,7 +94,7 @@ class IngestSummary:
 
     @property
     def exit_code(self) -> int:
-        """0 nothing is wrong, or nothing that is news; 1 all failed; 3 some failed, are damaged or empty."""
+        """0: no new problem; 1: all logs failed; 3: some failed, are damaged or empty."""
         if not any(result.is_new_problem for result in self.results):
             return 0
         return 1 if all(result.status == "failed" for result in self.results) else 3

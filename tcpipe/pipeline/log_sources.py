@@ -259,7 +259,7 @@ def _stat_files(path: Path) -> list[os.stat_result]:
 
 
 def recall_hash(source: LogSource, seen: LogSnapshot | None) -> LogSource:
-    """Return the source with its hash, where it was seen with these sizes and times."""
+    """Return the source with its hash if ``seen`` has the same sizes and times of its files."""
     dated = bool(source.files) and all(time_ns for _, time_ns in source.files)  # not every server tells the time
     is_same = dated and seen is not None and seen.size_and_time == source.files
     return replace(source, sha256=seen.sha256) if is_same and seen is not None else source

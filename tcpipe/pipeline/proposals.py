@@ -92,7 +92,7 @@ class ProposedRecipe:
         return f"{left}then: tcpipe preflight {shlex.quote(self.log)}{stated}"
 
     def toml(self) -> str:
-        """Return the file. The head of a table of decisions alone is a comment too; those below ``read`` may be empty."""
+        """Return the text of the recipe file; the head of a table is a comment if all its lines are."""
         is_open = any(not line.is_certain for line in self.lines)
         what = " Comments below it need a decision: remove the # and correct the value." if is_open else ""
         text = [f"# Proposed by tcpipe init --from.{what}", *(f"# {clean_line(line)}".rstrip() for line in self.head)]
@@ -524,7 +524,7 @@ def _align_clocks(
 
 
 def _make_recipe(lines: Sequence[ProposedLine]) -> Recipe:
-    """Return the recipe of the tables in lines that are certain, or become so when they are tried."""
+    """Return the recipe of the tables in certain lines, and in lines of the time zone and format, which a trial confirms."""
     tried = [line for line in lines if line.is_certain or line.key in ("stamp_zone", "stamp_format")]
     text = ProposedRecipe([], [replace(line, is_certain=True) for line in tried], "").toml()
     tables = {name: of for name, of in tomllib.loads(text).get("tables", {}).items() if "columns" in of}

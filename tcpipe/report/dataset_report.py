@@ -72,10 +72,8 @@ class SamplesShown:
 def render_dataset_report(directory: Path, beside: Path | None = None, *, samples: pa.Table | None = None) -> str:
     """Return the HTML page of the dataset in ``directory``; `DatasetError` for another data model.
 
-    ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too.
-    ``samples`` has at least
-    `SAMPLE_COLUMNS` of the samples; None: they are read.
-    Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
+    ``beside`` is the directory of the dataset; the page links to runs of stores in it. ``samples`` has at least `SAMPLE_COLUMNS`; None
+    reads them. If patches or pictures are lost or damaged, the page says so and omits them.
     """
     card = read_intact_card(directory)
     if samples is None:

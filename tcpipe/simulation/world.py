@@ -198,7 +198,7 @@ class Surface:
         return self.map_noise_std_m * evaluate_field(self.noise, u, v)
 
     def _by_class(self, name: str) -> Floats:
-        """Return one number of every class's look, by class id."""
+        """Return a property of the appearance of every class, by class id, shape (256,)."""
         table = np.zeros(256)
         table[list(self.looks)] = [getattr(look, name) for look in self.looks.values()]
         return table

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from graphlib import TopologicalSorter
+from importlib.metadata import PackageNotFoundError, metadata
 from itertools import pairwise
 from pathlib import Path
 
@@ -402,3 +403,25 @@ def test_no_registry_address_and_no_path_of_one_machine():
         if any(address in data for address in addresses) or machine_path.search(data):
             found.append(path.relative_to(ROOT).as_posix())
     assert not found
+
+
+def test_notice_lists_the_licences_of_all_dependencies():
+    """Those of packages that are installed are compared with their metadata; `dev` is not distributed."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = {"": project["dependencies"], **project["optional-dependencies"]}
+    wanted = {(Requirement(line).name, extra) for extra, lines in extras.items() if extra != "dev" for line in lines}
+    table = (ROOT / "NOTICE").read_text().partition("package                  extra    licence\n")[2].splitlines()
+    listed = {(line[:25].strip(), line[25:34].strip()): line[34:] for line in table}
+    assert set(listed) == wanted
+    for (name, extra), licence in listed.items():
+        try:
+            about = metadata(name)
+        except PackageNotFoundError:
+            assert extra, name
+            continue
+        stated = " ".join(
+            (about.get("License-Expression") or "", about.get("License") or "", *about.get_all("Classifier", []))
+        )
+        stated = stated.replace("Python Software Foundation", "PSF")
+        families = {re.split("[- ]", part)[0] for part in licence.split(" AND ")}
+        assert {family for family in families if family not in stated} == set(), name

@@ -187,7 +187,7 @@ class TopicTable:
                 self._decode_lengths(rows[part], data, starts[part], ends[part], dialect)
 
     def _decode_lengths(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64, dialect: Dialect) -> None:
-        """Decode messages, those of each length that many have apart: a field of them is a strided view."""
+        """Decode messages; many messages of equal length are decoded together, because each field of them is a strided view."""
         lengths = ends - starts
         if (lengths == lengths[0]).all():
             self._decode_dialect(rows, data, starts, ends, dialect)

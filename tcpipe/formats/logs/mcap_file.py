@@ -280,7 +280,7 @@ class McapPart(ChunkedPart[Chunk]):
             self._note("chunk-damaged", end)
 
     def _walk(self, contents: Contents, start: int, end: int) -> bool:
-        """Step from record to record; after one that cannot be, search for the next chunk. Return whether the data's end was met."""
+        """Step from record to record; after a damaged one, search for the next chunk. Return whether the end of the data was reached."""
         position = start
         while position + RECORD_HEAD <= end:
             if (after := self._take_loose_messages(contents, position, end)) > position:

@@ -169,7 +169,7 @@ def _place(message: Any, name: str, dtype: np.dtype[Any], serialize: Callable[[]
         written.append(serialize())
     object.__setattr__(owner, leaf, kept)
     if written[0].size != written[1].size or not (written[0] != written[1]).any():
-        raise UsageError(f"message field {name} has no fixed place among the bytes and cannot be a column")
+        raise UsageError(f"message field {name} has a position that varies with the message, so it cannot be a column")
     return int(np.flatnonzero(written[0] != written[1])[0])
 
 

@@ -194,7 +194,7 @@ def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool =
 
 
 def _refuse_sizes(kept: _Attributes, path: Path) -> None:
-    """Raise `StoreError` where a map says that it is larger than any, or cut otherwise than every map is."""
+    """Raise `StoreError` if the stated size of a map is above the limits, or its tiles and levels are not those that tcpipe writes."""
     rows, cols, pixel_size_m = kept.grid.rows, kept.grid.cols, kept.grid.pixel_size_m
     if not (0 < rows <= MAX_SIDE_PX and 0 < cols <= MAX_SIDE_PX and rows * cols <= MAX_PIXELS and pixel_size_m > 0):
         raise StoreError(
