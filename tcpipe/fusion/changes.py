@@ -223,16 +223,15 @@ def _find_spikes(series: Floats, least: Floats) -> NDArray[np.bool_]:
     return np.asarray((off > SPIKE_RATIO * np.maximum(np.median(off, axis=0), least)).any(axis=1))
 
 
-def _find_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return first and last row, the latter excluded, of each run of true rows."""
-    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
 def _find_long_runs(rows: Ints, mask: NDArray[np.bool_], period_s: float, kind: int) -> list[tuple[int, int]]:
-    """Return those runs of measurements at some ticks that last longer than a sensor that is not wrong may be rejected."""
-    runs = [run for run in _find_runs(mask) if run[1] - run[0] >= 5]  # fewer are single outliers
-    return [(first, last) for first, last in runs if (rows[last - 1] - rows[first] + 1) * period_s >= _REJECTED_S[kind]]
+    """Return the runs of true measurements at some ticks, first and last row, that last longer than a right sensor may be rejected.
+
+    The last row is excluded. Fewer than five rows are single outliers.
+    """
+    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    lasts_s = (rows[edges[:, 1] - 1] - rows[edges[:, 0]] + 1) * period_s
+    long = (np.diff(edges, axis=1)[:, 0] >= 5) & (lasts_s >= _REJECTED_S[kind])
+    return [(first, last) for first, last in edges[long].tolist()]
 
 
 def join_events(events: Sequence[Change]) -> tuple[Change, ...]:

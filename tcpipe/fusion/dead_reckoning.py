@@ -11,7 +11,6 @@ import numpy as np
 
 from tcpipe.arrays import Floats
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
-from tcpipe.fusion.process import turn_sources
 from tcpipe.fusion.signals import (
     Plane,
     compute_interval_means,
@@ -65,7 +64,7 @@ def _integrate_from_zero(stamp_s: Floats, values: Floats, at_s: Floats) -> Float
 
 def reckon_dead(m: Measurements, start_ns: int, bias_radps: float) -> DeadReckoning:
     """Return the path by the first odometry and the turns from ``start_ns`` on; the gyroscope's yaw rate has a bias."""
-    source, sources, imu = m.first_odometry, turn_sources(m), m.imu
+    source, sources, imu = m.first_odometry, list(m.turning_odometries().values()), m.imu
     yaw_s, rate, stamp_s, forward_mps = np.empty((4, 0))
     if source is not None:
         stamp_s, forward_mps = compute_seconds(source.stamp_ns, start_ns), source.velocity_mps[:, 0]

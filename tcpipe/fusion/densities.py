@@ -400,7 +400,6 @@ def _summarize(structure: Floats, data_share: float) -> GaussMarkov:
 def make_prior_model(measurements: Measurements) -> NoiseModel:
     """Return the noise by priors and claims alone."""
     gnss, imu = measurements.gnss, [IMU] if measurements.imu is not None else []
-    turning = [role for role, source in measurements.odometries().items() if np.isfinite(source.yaw_rate_radps).any()]
     return NoiseModel(
         horizontal=None if gnss is None else _make_fix_prior(gnss, slice(0, 2)),
         vertical=None if gnss is None else _make_fix_prior(gnss, slice(2, 3)),
@@ -415,7 +414,7 @@ def make_prior_model(measurements: Measurements) -> NoiseModel:
             role: SensorNoise(
                 _compute_density(stamp_ns, rate[:, 2]) + PRIORS[f"{role} turn"].variance, _make_process(f"{role} bias")
             )
-            for role in (*imu, *turning)
+            for role in (*imu, *measurements.turning_odometries())
             for stamp_ns, rate in [get_turn_rates(measurements, role)]
         },
         shared_scale=_make_process("shared scale"),

@@ -141,7 +141,9 @@ def prepare_section(m: Measurements, output_ns: Ints, gate_probability: float) -
     residuals, standing = find_residuals(m), find_stationary_intervals(m)
     m = inflate_unclaimed_fixes(m, residuals)
     noise = fit_noise(m, residuals)
-    ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
+    start_ns = [int(sensor.stamp_ns[0]) for role, sensor in m.sensors().items() if role != IMU]
+    first_ns, last_ns = min([*start_ns, int(output_ns[0])]), int(output_ns[-1])
+    ticks = build_ticks(m, noise, standing, first_ns, last_ns, output_ns=output_ns)
     return SectionModel(m, residuals, noise, ticks, make_priors(m, noise, ticks)[0], gate_probability)
 
 
@@ -364,12 +366,6 @@ def _list_candidates(made: Pass) -> tuple[list[tuple[str, int]], Candidates]:
     best = np.full((shape[0], 2 + 2 * shape[1]), -np.inf)
     earliest = round(1.0 / made.ticks.inputs.period_s)  # an event of the first second is an error of the start
     return possible, Candidates(places, stds, sizes, earliest, best)
-
-
-def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
-    """Return the first stamp of a measurement of motion, or that of the first wanted state if it is earlier [ns]."""
-    moving = [int(sensor.stamp_ns[0]) for role, sensor in m.sensors().items() if role != IMU]
-    return min(*moving, int(output_ns[0])) if moving else int(output_ns[0])
 
 
 def make_trajectory(

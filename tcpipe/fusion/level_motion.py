@@ -54,18 +54,6 @@ class Attitude:
     is_level: bool
 
 
-def find_turn_roles(measurements: Measurements) -> list[str]:
-    """Return the sensors that show turns, the best first: IMU, camera, wheels."""
-    imu = measurements.imu
-    usable = imu is not None and imu.stamp_ns.size >= _FEWEST and compute_median_period_ns(imu.stamp_ns) <= 100_000_000
-    sources = [
-        role
-        for role, each in measurements.odometries().items()
-        if np.count_nonzero(np.isfinite(each.yaw_rate_radps)) >= _FEWEST
-    ]
-    return ([IMU] if usable else []) + sources[::-1]
-
-
 def get_turn_rates(measurements: Measurements, role: str) -> tuple[Ints, Floats]:
     """Return stamps [ns] and angular velocities (N, 3) of a sensor; about x and y zero where it does not measure them."""
     if role == IMU and measurements.imu is not None:
@@ -81,18 +69,19 @@ def get_turn_rates(measurements: Measurements, role: str) -> tuple[Ints, Floats]
 
 def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Attitude | None:
     """Return the attitude from ``zero_ns`` on; None where no sensor shows turns."""
-    roles = find_turn_roles(measurements)
-    if not roles or end_s < 2 * STEP_S:
+    imu = measurements.imu
+    shows = imu is not None and imu.stamp_ns.size >= _FEWEST and compute_median_period_ns(imu.stamp_ns) <= 100_000_000
+    role = IMU if shows else next(reversed(measurements.turning_odometries()), "")
+    if not role or end_s < 2 * STEP_S:
         return None
     time_s = np.arange(0.0, end_s + STEP_S, STEP_S)
-    stamp_ns, rate = get_turn_rates(measurements, roles[0])
+    stamp_ns, rate = get_turn_rates(measurements, role)
     means = compute_interval_means(compute_seconds(stamp_ns, zero_ns), rate, time_s[:-1], time_s[1:])
     rate = np.concatenate((means, means[-1:]))
-    imu = measurements.imu
-    if roles[0] != IMU or imu is None or not imu.accelerometer_usable:
+    if role != IMU or imu is None or not imu.accelerometer_usable:
         yaw = integrate_grid(rate[:, 2])
         rotation = matrix_from_quat(quat_from_rpy(0.0 * yaw, 0.0 * yaw, yaw))
-        return Attitude(time_s, rotation, yaw, rate, roles[0], stamp_ns, is_level=False)
+        return Attitude(time_s, rotation, yaw, rate, role, stamp_ns, is_level=False)
     force = _mean_force(measurements, imu, zero_ns, time_s, rate)
     quat = _multiply_increments(rate[:-1] * STEP_S)
     up = _find_up(quat, force)
@@ -220,21 +209,6 @@ class _Fit:
     noise_m: float = np.inf
 
 
-def solve_robust(matrix: Floats, target: Floats, start: Floats, std: Floats) -> Floats:
-    """Return the factors (C,) of M equations by weights that fall with the square of a residual (Cauchy's loss), with a prior about zero.
-
-    ``start`` are the first factors, ``std`` their standard deviations beforehand, infinite for none.
-    """
-    found = start
-    for _ in range(_ROUNDS):
-        off = target - multiply_by_vector(matrix, found)
-        noise = float(np.median(np.abs(off))) + 1e-9
-        root = 1.0 / (1.0 + np.square(off / (2.5 * noise)))
-        rows = np.concatenate((matrix * root[:, None], np.diag(noise / std)))
-        found = solve_least_squares(rows, np.concatenate((target * root, np.zeros(std.size))))
-    return found
-
-
 class _Alignment:
     """Windows of fixes, and least squares over them; the horizontal plane as complex numbers."""
 
@@ -336,6 +310,11 @@ class _Alignment:
         hats = np.maximum(0.0, 1.0 - np.abs(self._middle_s[:, None] - knots_s) / knots_s[1])
         path = self._difference(integrate_grid(speed)).real
         rise = self._moved_m[:, 2] - self._difference(integrate_grid(climb) + self._arm_m[:, 2]).real
-        start, std = np.zeros(knots_s.size), np.full(knots_s.size, 0.1)
-        pitch = solve_robust(hats * path[:, None], rise, start, std)
+        matrix, pitch = hats * path[:, None], np.zeros(knots_s.size)
+        for _ in range(_ROUNDS):
+            off = rise - multiply_by_vector(matrix, pitch)
+            noise = float(np.median(np.abs(off))) + 1e-9
+            root = 1.0 / (1.0 + np.square(off / (2.5 * noise)))
+            rows = np.concatenate((matrix * root[:, None], np.eye(knots_s.size) * (noise / 0.1)))
+            pitch = solve_least_squares(rows, np.concatenate((rise * root, np.zeros(knots_s.size))))
         return np.interp(self._attitude.time_s, knots_s, pitch)

@@ -206,6 +206,11 @@ class Measurements:
         every = {WHEELS: self.wheels, VISUAL: self.visual}
         return {role: odometry for role, odometry in every.items() if odometry is not None}
 
+    def turning_odometries(self) -> dict[str, BodyVelocities]:
+        """Return the odometries that have a yaw rate, by role: the wheels, which skid, then the camera."""
+        every = self.odometries().items()
+        return {role: odometry for role, odometry in every if np.isfinite(odometry.yaw_rate_radps).any()}
+
     @property
     def first_odometry(self) -> BodyVelocities | None:
         """The wheels, else visual odometry."""

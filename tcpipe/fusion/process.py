@@ -52,14 +52,9 @@ _MIN_DENSITY = 1e-4  # least density of velocity [m²/s³]: 1 cm/s in a second, 
 _UNKNOWN_DENSITY = 0.3  # density of velocity that no sensor shows [m²/s³]
 
 
-def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
-    """Return the odometries with a yaw rate, for where there is no gyroscope: the wheels, which skid, then visual odometry."""
-    return [source for source in measurements.odometries().values() if np.isfinite(source.yaw_rate_radps).any()]
-
-
 def is_turned_by_course(m: Measurements) -> bool:
     """Return whether only the course over ground shows how the robot turns: fixes, and odometry without a yaw rate."""
-    return m.gnss is not None and m.imu is None and bool(m.odometries()) and not turn_sources(m)
+    return m.gnss is not None and m.imu is None and bool(m.odometries()) and not m.turning_odometries()
 
 
 def turn_scale_std(measurements: Measurements) -> float:
@@ -71,8 +66,8 @@ def turn_scale_std(measurements: Measurements) -> float:
         return 0.0
     if measurements.imu is not None:
         return _TURN_SCALE_STD[IMU]
-    sources = turn_sources(measurements)
-    return _TURN_SCALE_STD[VISUAL if sources[-1] is measurements.visual else WHEELS] if sources else 0.0
+    roles = list(measurements.turning_odometries())
+    return _TURN_SCALE_STD[roles[-1]] if roles else 0.0
 
 
 def is_length_observable(m: Measurements, fixes: SensorNoise | None) -> bool:

@@ -26,7 +26,6 @@ from tcpipe.fusion.process import (
     UNSEEN_TURN_RADPS,
     is_turned_by_course,
     make_motion_noise,
-    turn_sources,
 )
 from tcpipe.fusion.signals import (
     compute_interval_means,
@@ -342,7 +341,7 @@ def _compute_odometric_turn_rate(
     if m.gnss is not None and is_turned_by_course(m):
         stamp_s, values = compute_course_rate(m.gnss, m.first_odometry, zero_ns)
         rate[:, 2] = compute_interval_means(stamp_s, values[:, None], start_s, end_s)[:, 0]
-    for rank, source in enumerate(turn_sources(m)):
+    for rank, source in enumerate(m.turning_odometries().values()):
         known = np.isfinite(source.yaw_rate_radps)
         turns = source.turn_rate_radps
         values = np.stack((0 * source.yaw_rate_radps,) * 2 + (source.yaw_rate_radps,), -1) if turns is None else turns
