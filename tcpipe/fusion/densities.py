@@ -23,11 +23,13 @@ from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std, solve_non_nega
 class GaussMarkov:
     """A stationary process with covariance ``variance * exp(-|dt| / time_s)``; variance in the unit squared of what it errs in.
 
+    Without a time white noise, by its density.
+
     ``data_share``: share of the variance that the data determine; the rest is the prior's.
     """
 
     variance: float
-    time_s: float
+    time_s: float = 0.0
     data_share: float = 0.0
 
     def difference_variance(self, time_s: Floats) -> Floats:
@@ -72,45 +74,36 @@ class NoiseModel:
     """By axis, the fitted densities by the names of `tcpipe.fusion.pair_residuals.Residuals.features`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Prior:
-    """A variance or density, with its correlation time, and how many times as large it may well be (1σ)."""
-
-    variance: float
-    time_s: float = 0.0
-    times: float = 1.0
-
-
 PRIORS = {
     # Share of the claimed variance. RTK: 0.8 cm of 1.5 cm (real logs: 0.5 to 3 cm over 5 to 60 s); code phase: atmosphere and orbits.
-    "fix, centimetres": Prior(0.3, 15.0),
-    "fix, more": Prior(0.8, 60.0),
+    "fix, centimetres": GaussMarkov(0.3, 15.0),
+    "fix, more": GaussMarkov(0.8, 60.0),
     # m²/s beside the noise that the samples show: 2 mm after a second.
-    "wheel_odometry velocity": Prior(4e-6),
-    "visual_odometry velocity": Prior(4e-6),
+    "wheel_odometry velocity": GaussMarkov(4e-6),
+    "visual_odometry velocity": GaussMarkov(4e-6),
     # [1]: slip by load and ground; cameras vary by 5 to 15 % on slopes. Shared: tilt and slip that no pair of odometries shows.
-    "wheel_odometry scale": Prior(0.01**2, 30.0, 4.0),
-    "visual_odometry scale": Prior(0.03**2, 30.0, 4.0),
-    "shared scale": Prior(0.003**2, 30.0),
-    "slide velocity": Prior(1e-4),  # m²/s: 1 cm sideways after a second
+    "wheel_odometry scale": GaussMarkov(0.01**2, 30.0),
+    "visual_odometry scale": GaussMarkov(0.03**2, 30.0),
+    "shared scale": GaussMarkov(0.003**2, 30.0),
+    "slide velocity": GaussMarkov(1e-4),  # m²/s: 1 cm sideways after a second
     # rad²: what the alignment leaves of heading and pitch; roll and pitch where no accelerometer measures them.
-    "heading scale": Prior(0.005**2, 30.0),
-    "pitch scale": Prior(0.0015**2, 30.0),
-    "stamp": Prior(0.003**2),  # s²: time stamps of fixes, which err by as much times the velocity
+    "heading scale": GaussMarkov(0.005**2, 30.0),
+    "pitch scale": GaussMarkov(0.0015**2, 30.0),
+    "stamp": GaussMarkov(0.003**2),  # s²: time stamps of fixes, which err by as much times the velocity
     # rad²/s beside the noise that the samples show.
-    "imu turn": Prior(1e-8),
-    "wheel_odometry turn": Prior(1e-5),
-    "visual_odometry turn": Prior(1e-6),
+    "imu turn": GaussMarkov(1e-8),
+    "wheel_odometry turn": GaussMarkov(1e-5),
+    "visual_odometry turn": GaussMarkov(1e-6),
     # rad²/s²: in-run instability of uncooled MEMS, 0.04 °/s.
-    "imu bias": Prior(7e-4**2, 100.0),
-    "wheel_odometry bias": Prior(1e-3**2, 100.0),
-    "visual_odometry bias": Prior(3e-4**2, 100.0),
+    "imu bias": GaussMarkov(7e-4**2, 100.0),
+    "wheel_odometry bias": GaussMarkov(1e-3**2, 100.0),
+    "visual_odometry bias": GaussMarkov(3e-4**2, 100.0),
     # [1]: wheels skid in turns.
-    "imu turn scale": Prior(1e-3**2, 100.0),
-    "wheel_odometry turn scale": Prior(0.1**2, 100.0),
-    "visual_odometry turn scale": Prior(0.02**2, 100.0),
+    "imu turn scale": GaussMarkov(1e-3**2, 100.0),
+    "wheel_odometry turn scale": GaussMarkov(0.1**2, 100.0),
+    "visual_odometry turn scale": GaussMarkov(0.02**2, 100.0),
 }
-"""Variances and densities before the fit; units in the comments."""
+"""Variances before the fit, and densities of white noise, which have no correlation time; units in the comments."""
 
 _FLOOR_M, _FLOOR_SHARE = 0.002, 0.0025
 """Of the white noise of fixes, absolute and of the claimed variance: receivers that filter repeat their errors to 0.1 mm."""
@@ -345,7 +338,8 @@ def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
     elif kind == "heading scale":
         variance = _find_heading_variance(prior)
     share = _share_process(known.time_s, float(last), SCALE_S) if known.time_s else 1.0
-    return share * variance, known.times * variance
+    # The scale of an odometry may well vary by several times as much.
+    return share * variance, 4.0 * variance if kind.endswith("odometry scale") else variance
 
 
 def _find_fix_prior(
@@ -406,18 +400,18 @@ def make_prior_model(measurements: Measurements) -> NoiseModel:
         odometries={
             role: SensorNoise(
                 _compute_density(each.stamp_ns, each.velocity_mps[:, 0]) + PRIORS[f"{role} velocity"].variance,
-                _make_process(f"{role} scale"),
+                PRIORS[f"{role} scale"],
             )
             for role, each in measurements.odometries().items()
         },
         turns={
             role: SensorNoise(
-                _compute_density(stamp_ns, rate[:, 2]) + PRIORS[f"{role} turn"].variance, _make_process(f"{role} bias")
+                _compute_density(stamp_ns, rate[:, 2]) + PRIORS[f"{role} turn"].variance, PRIORS[f"{role} bias"]
             )
             for role in (*imu, *measurements.turning_odometries())
             for stamp_ns, rate in [get_turn_rates(measurements, role)]
         },
-        shared_scale=_make_process("shared scale"),
+        shared_scale=PRIORS["shared scale"],
     )
 
 
@@ -428,10 +422,6 @@ def _make_fix_prior(gnss: Positions, axes: slice) -> SensorNoise:
         return SensorNoise(claimed, GaussMarkov(0.0, _SHARE_S), claimed)
     prior = PRIORS["fix, centimetres" if claimed < _CENTIMETRES_M2 else "fix, more"]
     return SensorNoise((1.0 - prior.variance) * claimed, GaussMarkov(prior.variance * claimed, prior.time_s), claimed)
-
-
-def _make_process(name: str) -> GaussMarkov:
-    return GaussMarkov(PRIORS[name].variance, PRIORS[name].time_s)
 
 
 def _compute_density(stamp_ns: NDArray[np.int64], values: Floats) -> float:

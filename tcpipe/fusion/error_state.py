@@ -32,14 +32,7 @@ from tcpipe.fusion.changes import (
 )
 from tcpipe.fusion.dead_reckoning import compute_course
 from tcpipe.fusion.densities import PRIORS, NoiseModel, fit_noise, inflate_unclaimed_fixes
-from tcpipe.fusion.filter_kernel import (
-    FilterModel,
-    GateVerdict,
-    Memory,
-    Tests,
-    allocate_steps,
-    filter_ticks,
-)
+from tcpipe.fusion.filter_kernel import FilterModel, GateVerdict, Memory, Tests, allocate_steps, filter_ticks
 from tcpipe.fusion.initial import find_stationary_intervals
 from tcpipe.fusion.measurements import (
     DISPLACEMENT_LAGS_S,
@@ -56,21 +49,8 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.pair_residuals import Residuals, find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, find_walk, make_model, make_priors, make_start, widen_start
-from tcpipe.fusion.process import (
-    GROUND,
-    SLOPE_RAD,
-    UNSEEN_TURN_RADPS,
-    find_best_scale_std,
-    is_length_observable,
-)
-from tcpipe.fusion.smoother_kernel import (
-    LARGEST_EVENT,
-    SELDOM,
-    Candidates,
-    Smoothed,
-    make_adjoint,
-    smooth_ticks,
-)
+from tcpipe.fusion.process import GROUND, SLOPE_RAD, UNSEEN_TURN_RADPS, find_best_scale_std, is_length_observable
+from tcpipe.fusion.smoother_kernel import LARGEST_EVENT, SELDOM, Candidates, Smoothed, make_adjoint, smooth_ticks
 from tcpipe.fusion.state import Error, Kind
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
@@ -208,7 +188,6 @@ class SectionModel:
             period_s=ticks.inputs.period_s,
             gate_probability=self.gate_probability,
             time_s=time_s,
-            follows=not judges,
             possible=POSSIBLE if judges else (),
         )
         return ticks, model, widen_start(start, std).select(model.active)
@@ -424,19 +403,13 @@ def _make_motion(x: Floats, ticks: Ticks, at: Ints) -> tuple[Floats, Floats, Flo
     """Return attitude of the robot, shape (N, 3, 3), velocity in ENU [m/s] and angular velocity in its axes [rad/s], shapes (N, 3)."""
     imu = x[:, :9].reshape(-1, 3, 3)
     mount = x[:, Error.MOUNT + 6 : Error.MOUNT + 9]
-    rotation = imu + imu @ _make_skew(mount)
+    rotation = imu + np.cross(imu, mount[:, None])  # a small turn
     rotation = matrix_from_quat(quat_from_matrix(rotation)) if mount.any() else imu
     velocity = np.einsum("nij,nj->ni", imu, x[:, Error.U + 6 : Error.U + 9])
     gyro = ticks.inputs.has_gyro[at, None]
     bias, scale = x[:, Error.GYRO_BIAS + 6 : Error.GYRO_BIAS + 9], x[:, Error.TURN_SCALE + 6, None]
     rate = (ticks.inputs.rate[at] - np.where(gyro, bias, 0.0)) * (1.0 - scale)
     return rotation, velocity, rate - np.cross(mount, rate)
-
-
-def _make_skew(v: Floats) -> Floats:
-    zero = np.zeros(v.shape[0])
-    rows = ((zero, -v[:, 2], v[:, 1]), (v[:, 2], zero, -v[:, 0]), (-v[:, 1], v[:, 0], zero))
-    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def _interpolate_links(smoothed: Smoothed, at: Ints, output_ns: Ints) -> Floats:

@@ -102,12 +102,13 @@ def _mean_force(
     means = compute_interval_means(
         compute_seconds(imu.stamp_ns, zero_ns), imu.specific_force_mps2, time_s - 0.5 * STEP_S, time_s + 0.5 * STEP_S
     )
-    for source in measurements.odometries().values():
-        speed_s = compute_seconds(source.stamp_ns, zero_ns)
-        speed = average_grid(np.interp(time_s, speed_s, source.velocity_mps[:, 0])[:, None], 0.5)[:, 0]
-        acceleration = (np.gradient(speed, STEP_S), rate[:, 2] * speed, -rate[:, 1] * speed)
-        return np.asarray(means - np.stack(acceleration, -1))
-    return means
+    source = measurements.first_odometry
+    if source is None:
+        return means
+    speed_s = compute_seconds(source.stamp_ns, zero_ns)
+    speed = average_grid(np.interp(time_s, speed_s, source.velocity_mps[:, 0])[:, None], 0.5)[:, 0]
+    acceleration = (np.gradient(speed, STEP_S), rate[:, 2] * speed, -rate[:, 1] * speed)
+    return np.asarray(means - np.stack(acceleration, -1))
 
 
 def average_grid(values: Floats, window_s: float) -> Floats:

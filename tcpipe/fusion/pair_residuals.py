@@ -30,13 +30,7 @@ from tcpipe.fusion.level_motion import (
     make_free_track,
 )
 from tcpipe.fusion.measurements import GNSS, Measurements, Positions
-from tcpipe.fusion.signals import (
-    compute_seconds,
-    find_longest_step_ns,
-    interpolate_signal,
-    is_in_gap,
-    remove_spikes,
-)
+from tcpipe.fusion.signals import compute_seconds, find_longest_step_ns, interpolate_signal, is_in_gap, remove_spikes
 
 ALONG, ACROSS, UP = "along", "across", "up"
 FIX_S, SCALE_S = (1.0, 3.0, 10.0, 30.0, 100.0), (3.0, 10.0, 30.0, 100.0)

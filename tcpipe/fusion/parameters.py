@@ -13,7 +13,7 @@ import numpy as np
 
 from tcpipe.arrays import Floats
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import GaussMarkov, NoiseModel, Prior
+from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory
 from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements, Positions
 from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, is_length_observable, turn_scale_std
@@ -136,7 +136,7 @@ def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> 
     return np.asarray(np.sqrt(variance))
 
 
-def find_walk(process: GaussMarkov | Prior) -> float:
+def find_walk(process: GaussMarkov) -> float:
     """Return the deviation of a second's walk that strays as far as a Gauss-Markov process over a minute."""
     return float(np.sqrt(2.0 * process.variance * -np.expm1(-_MINUTE_S / process.time_s) / _MINUTE_S))
 
@@ -190,13 +190,12 @@ def make_model(
     *,
     period_s: float,
     gate_probability: float,
-    follows: bool = True,
     time_s: Floats | None = None,
     possible: Sequence[int] = (),
 ) -> FilterModel:
-    """Return the filter's model; unless it ``follows``, rejected fixes are never taken to be right after all.
+    """Return the filter's model.
 
-    ``possible``: errors that other events could change.
+    ``possible``: errors that other events could change; where these are judged, rejected fixes are never taken to be right after all.
     """
     kept = np.ones(state.N) if time_s is None else np.exp(-period_s / time_s)
     involved = {event.place for event in events} | set(possible)
@@ -221,7 +220,7 @@ def make_model(
         kept=kept[active],
         noise=np.square(walk[active]) * period_s + np.square(std[active]) * (1.0 - kept[active] ** 2),
         gates=gates,
-        patience=_find_patience(m, follows=follows),
+        patience=_find_patience(m, follows=not possible),
         mount=position.get(Error.MOUNT, -1),
         scales=scales,
         events=np.array([(e.tick, position[e.place], e.is_new) for e in events], np.int64).reshape(-1, 3),

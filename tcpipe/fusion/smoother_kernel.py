@@ -23,14 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tcpipe.compiled import compile_kernel
-from tcpipe.fusion.filter_kernel import (
-    FilterModel,
-    Indices,
-    Steps,
-    TickInputs,
-    factorize,
-    turn_rows,
-)
+from tcpipe.fusion.filter_kernel import FilterModel, Indices, Steps, TickInputs, factorize, turn_rows
 from tcpipe.fusion.state import KINDS, SIZES, Error, Matrix, Mode, N, Vector, displace_state
 
 
@@ -188,6 +181,16 @@ def step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint
 
 
 @compile_kernel
+def _turn_covariance(x: Vector, c: Matrix, axis: int, other: int) -> float:
+    """Return the covariance of the positions along two axes of ENU, of errors along those of the state."""
+    s = 0.0
+    for i in range(3):
+        for j in range(3):
+            s += x[3 * axis + i] * x[3 * other + j] * c[Error.RHO + i, Error.RHO + j]
+    return s
+
+
+@compile_kernel
 def _smooth_tick(
     k: int,
     P: Matrix,
@@ -242,11 +245,7 @@ def _smooth_tick(
         for j in range(size):
             c[j, i - 3] += c[j, 6 + i]
     for axis in range(3):
-        s = 0.0
-        for i in range(3):
-            for j in range(3):
-                s += x[3 * axis + i] * x[3 * axis + j] * c[Error.RHO + i, Error.RHO + j]
-        out.variances[k, axis] = s
+        out.variances[k, axis] = _turn_covariance(x, c, axis, axis)
     level2 = max(x[0] * x[0] + x[3] * x[3], 1e-6)  # yaw = atan2(R10, R00)
     jy, jz = x[7] / level2, x[8] / level2
     out.variances[k, 3] = jy * jy * c[1, 1] + 2.0 * jy * jz * c[1, 2] + jz * jz * c[2, 2]
@@ -262,10 +261,8 @@ def _smooth_tick(
             s = 0.0
             for axis in range(2):
                 for other in range(axis, 2):
-                    v = ends[q, 2 + axis + other]
+                    v = ends[q, 2 + axis + other] + _turn_covariance(x, c, axis, other)
                     for i in range(3):
-                        for j in range(3):
-                            v += x[3 * axis + i] * x[3 * other + j] * c[Error.RHO + i, Error.RHO + j]
                         line = P[Error.RHO + i]
                         for j in range(n):
                             v -= line[j] * x[3 * axis + i] * rows[1 + 2 * q + other, j]
@@ -281,11 +278,7 @@ def _smooth_tick(
         ends[q, 0], ends[q, 1] = out.states[k, 9], out.states[k, 10]
         for axis in range(2):
             for b in range(axis, 2):
-                s = 0.0
-                for i in range(3):
-                    for j in range(3):
-                        s += x[3 * axis + i] * x[3 * b + j] * c[Error.RHO + i, Error.RHO + j]
-                ends[q, 2 + axis + b] = s
+                ends[q, 2 + axis + b] = _turn_covariance(x, c, axis, b)
             after[:] = 0.0
             for j in range(n):
                 for i in range(3):
