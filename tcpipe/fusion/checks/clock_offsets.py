@@ -59,19 +59,12 @@ ROLES = (IMU, WHEELS, VISUAL, GNSS)
 """Sensors in the order in which their clocks are taken for the right one: a gyroscope has the least to compute."""
 NOTED_S = 0.05
 """Least time offset that a person should act on [s]."""
-_MAX_STD_S, _MAX_RELATIVE_STD = 0.02, 0.1
-"""Largest σ of an offset that is known [s]; and relative to it [1]: the mean of a clock that steps has a larger one."""
 _MIN_EXPLAINED = 0.25
 """Least share of a signal's variance that another one on the right clock explains: noise and slip are the rest."""
-_LEAST_STD_S, _LEAST_BY_FORCE_S, _COARSE_STD_S = 1e-3, 0.02, 0.1
-"""Standard deviations of offsets [s]: at least; by an accelerometer, which slopes act on; by the coarse search."""
 _WINDOW_NS, _MIN_WINDOWS = (40_000_000_000, 600_000_000_000), 3
 """Least and most time in which a clock does not drift [ns], a fifth of the run in between, and how many of these show a drift."""
 _DRIFT_STD = 1e-3  # standard deviation of a clock's drift before the run shows it [1]: ten times that of a quartz
-_LIVELY, _NEAR_ROWS = 0.1, round(2.0 / GRID_S)
-"""Yaw rate [rad/s] or change of speed [m/s] of a manoeuvre, and rows around one that are compared: 2 s."""
-
-YAW_RATE, SPEED, ACCELERATION = "yaw rate", "speed", "acceleration"
+_COARSE_STD_S = 0.1  # standard deviation of an offset by the coarse search [s]
 
 
 def find_clock_offsets(m: Measurements, *, clock_epoch: int = 0) -> ClockFacts:
@@ -151,6 +144,11 @@ def _compute_lateness(offset: ClockOffset, from_middle_s: Floats | float) -> Flo
     return np.asarray(offset.offset_s + 1e-6 * offset.drift_ppm * from_middle_s)
 
 
+def _is_significant(difference_s: float, std_s: float) -> bool:
+    """Return whether a difference of clocks is certain, and large enough that a person should act on it."""
+    return bool(abs(difference_s) > max(NOTED_S, MIN_SIGMAS * std_s))
+
+
 def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float, Plane]]) -> list[ClockPair]:
     """Return two sensors compared: in each window if three show one offset and drift, else over the run."""
     lags = [(at_s, lag) for at_s, sums in windows if (lag := estimate_lag([sums]))]
@@ -158,19 +156,18 @@ def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float,
     known = [pair for pair in pairs if pair.explained >= _MIN_EXPLAINED and pair.std_s <= NOTED_S]
     if len(known) >= _MIN_WINDOWS:
         at_s, offset_s, std_s = np.array([(pair.from_middle_s, pair.offset_s, pair.std_s) for pair in known]).T
-        line = np.polyfit(at_s, offset_s, 1, w=1.0 / np.maximum(std_s, _LEAST_STD_S))
-        misfit_s = np.abs(offset_s - np.polyval(line, at_s))
-        if (misfit_s <= np.maximum(MIN_SIGMAS * std_s, NOTED_S)).all():
+        misfit_s = offset_s - np.polyval(np.polyfit(at_s, offset_s, 1, w=1.0 / std_s), at_s)
+        if not any(map(_is_significant, misfit_s, std_s)):
             return [replace(pair, determined=True) for pair in known]
     whole = estimate_lag([sums for _, sums in windows])
-    return [make_pair(late, against, by, whole)] if whole and np.isfinite(whole.std_s) else []
+    return [make_pair(late, against, by, whole)] if whole else []
 
 
 def make_pair(late: str, against: str, by: str, lag: Lag) -> ClockPair:
-    """Return two sensors compared; a lag is determined where its error is small or it is surely not zero."""
-    is_sharp = lag.std_s <= max(_MAX_STD_S, _MAX_RELATIVE_STD * abs(lag.offset_s))
-    determined = is_sharp and lag.explained >= _MIN_EXPLAINED
-    return ClockPair(late, against, by, lag.offset_s, lag.std_s, lag.explained, determined)
+    """Return two sensors compared; a lag is determined to 0.02 s or a tenth of it: the mean of a clock that steps has a larger σ."""
+    std_s = max(lag.std_s, 0.02 if by == "acceleration" else 1e-3)  # slopes act on accelerometers
+    determined = std_s <= max(0.02, 0.1 * abs(lag.offset_s)) and lag.explained >= _MIN_EXPLAINED
+    return ClockPair(late, against, by, lag.offset_s, std_s, lag.explained, determined)
 
 
 def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tuple[str, str, str, Signal, Signal]]:
@@ -180,23 +177,23 @@ def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tupl
         turn, force, _ = resample_imu(m.imu, at_ns)
         for role, twist in twists.items():
             turning, changes = average(twist[:, 1], SMOOTH_S), find_quick_part(average(twist[:, 0], SMOOTH_S))
-            yield role, IMU, YAW_RATE, _select_near(turning, turning), average(turn, SMOOTH_S)
+            yield role, IMU, "yaw rate", _select_near(turning, turning), average(turn, SMOOTH_S)
             if m.imu.accelerometer_usable:
-                yield role, IMU, ACCELERATION, _select_near(changes, compute_acceleration(twist)), force
+                yield role, IMU, "acceleration", _select_near(changes, compute_acceleration(twist)), force
     if len(twists) == 2:
         target, seen = (find_quick_part(average(np.abs(twists[role][:, 0]), SMOOTH_S)) for role in (VISUAL, WHEELS))
-        yield VISUAL, WHEELS, SPEED, _select_near(seen, target), seen
+        yield VISUAL, WHEELS, "speed", _select_near(seen, target), seen
     if m.gnss is not None:
         velocity = find_quick_part(np.abs(compute_fix_velocity(m.gnss, at_ns)))
         for role, twist in twists.items():
             speed = _compute_antenna_speed(twist, m.gnss.lever_arm_m)
             seen = find_quick_part(average(average(speed, FIXES_S), FIXES_S))
-            yield GNSS, role, SPEED, _select_near(seen, velocity), seen
+            yield GNSS, role, "speed", _select_near(seen, velocity), seen
 
 
 def _select_near(lively: Floats, values: Signal) -> Signal:
-    """Return values near rows in which another signal is large, NaN elsewhere, shape (M,)."""
-    is_near = compute_moving_mean(1.0 * (np.abs(lively) > _LIVELY), _NEAR_ROWS, least=0.0) > 0.0
+    """Return values within 2 s of rows in which another signal [rad/s] or [m/s] is beyond 0.1, NaN elsewhere, shape (M,)."""
+    is_near = compute_moving_mean(1.0 * (np.abs(lively) > 0.1), round(2.0 / GRID_S), least=0.0) > 0.0
     return np.where(is_near, values, np.nan)
 
 
@@ -232,8 +229,13 @@ def solve_offsets(
     }
     reference = max(solved, key=lambda role: len(agreeing[role]))  # the first of equals
     offsets = {reference: ClockOffset(0.0, 0.0, noted=False)} | solved[reference]
-    blamed = {role: _is_blamed(role, agreeing[reference], offsets, known) for role in offsets}
-    decided = {role: replace(offset, blamed=blamed[role]) for role, offset in solved[reference].items()}
+    # A sensor is blamed only where two others agree against it and no pair contradicts.
+    misfits = ((_compute_misfit_s(pair, offsets), pair.std_s) for pair in known if pair.late in offsets)
+    is_sure = len(agreeing[reference]) > 1 and not any(_is_significant(*misfit) for misfit in misfits)
+    decided = {
+        role: replace(offset, blamed=is_sure and role not in agreeing[reference])
+        for role, offset in solved[reference].items()
+    }
     return ClockFacts(clock_epoch, reference, tuple(pairs), decided)
 
 
@@ -242,8 +244,7 @@ def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) ->
     connected = _find_connected(reference, pairs)
     used = [pair for pair in pairs if pair.late in connected]
     free = [role for role in ROLES if role in connected and role != reference]
-    std = np.array([max(p.std_s, _LEAST_BY_FORCE_S if p.by == ACCELERATION else _LEAST_STD_S) for p in used])
-    at_s = np.array([pair.from_middle_s for pair in used])
+    std, at_s = np.array([(pair.std_s, pair.from_middle_s) for pair in used]).T
     signs = np.array([[(role == p.late) - float(role == p.against) for role in free] for p in used]) / std[:, None]
     prior = np.hstack((np.zeros((len(free), len(free))), np.eye(len(free)) / _DRIFT_STD))
     design = np.vstack((np.hstack((signs, signs * at_s[:, None])), prior))
@@ -256,8 +257,8 @@ def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) ->
     for role, (offset_s, rate), (std_s, rate_std) in zip(
         free, found.reshape(2, -1).T.tolist(), stds.reshape(2, -1).T.tolist(), strict=True
     ):
-        drifts = abs(rate) > max(MIN_SIGMAS * np.sqrt(birge) * rate_std, NOTED_S / max(span_s, 1.0))
-        noted = bool(drifts or abs(offset_s) > max(NOTED_S, MIN_SIGMAS * std_s))
+        drifts = _is_significant(rate * span_s, np.sqrt(birge) * rate_std * span_s)
+        noted = drifts or _is_significant(offset_s, std_s)
         offsets[role] = ClockOffset(offset_s, std_s, noted, drift_ppm=1e6 * rate if drifts else 0.0)
     return offsets
 
@@ -278,15 +279,6 @@ def _find_connected(role: str, pairs: Collection[ClockPair]) -> set[str]:
     return connected
 
 
-def _is_blamed(
-    role: str, agreeing: Collection[str], offsets: Mapping[str, ClockOffset], pairs: Sequence[ClockPair]
-) -> bool:
-    """Return whether two sensors that agree speak against a role, and no pair contradicts any of them."""
-    among = [p for p in pairs if {p.late, p.against} <= {role, *agreeing}]
-    is_contradicted = any(abs(_compute_misfit_s(p, offsets)) > max(MIN_SIGMAS * p.std_s, NOTED_S) for p in among)
-    return role not in agreeing and not is_contradicted and len(_find_connected(role, among)) > 2
-
-
 def _compare_roughly(m: Measurements) -> Iterator[ClockPair]:
     """Yield how late sensors' stamps are against each other by speed and turn rate over the liveliest half hour."""
     at_ns = find_liveliest_window_ns(m)
@@ -303,4 +295,4 @@ def _compare_roughly(m: Measurements) -> Iterator[ClockPair]:
     for against, late in combinations(signals, 2):
         lag_s = find_coarse_lag(signals[late], signals[against])
         if lag_s is not None:
-            yield ClockPair(late, against, SPEED, lag_s, _COARSE_STD_S, 1.0, determined=True)
+            yield ClockPair(late, against, "speed", lag_s, _COARSE_STD_S, 1.0, determined=True)

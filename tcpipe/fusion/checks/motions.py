@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS, DeadReckoning
@@ -194,11 +193,10 @@ def dead_reckon(twist: Floats) -> Plane:
 MAX_LAG_S = 1.2
 """Largest lag of the fine search [s]."""
 _STEPS = round(MAX_LAG_S / GRID_S)
-_GROUPS, _MIN_GROUPS, _MIN_GROUP_S, _MIN_SPANS = 20, 8, 2.0, 4
-"""Most and fewest groups of the jackknife, their least length [s], and how many separate spans of time have to show a lag."""
+_GROUPS, _MIN_GROUPS, _MIN_GROUP_S = 20, 4, 2.0
+"""Most and fewest groups of time of the jackknife, and their least length [s]."""
 _INDEPENDENT = 10
 """Rows between independent residuals: signals are smoothed over 0.1 s to 0.2 s, those of the coarse search over 1 s, which is 5 rows."""
-_MIN_CHI_SQUARED = 10.83  # by how much a rival peak must fit worse [1]: 99.9 % of χ² with one degree of freedom
 _TINY = 1e-12  # least variance, and least share of it, that a division bears
 
 
@@ -215,42 +213,6 @@ class Lag:
     factor: complex = 1.0
 
 
-class Products:
-    """Sums of products of a target and a regressor by group of time and lag."""
-
-    def __init__(self, sums: Plane) -> None:
-        """Take the sums of `sum_products`, shape (6, G, L)."""
-        n, x, xx, y, yx, yy = sums
-        self.rows = np.rint(n.real)
-        count = np.maximum(self.rows, 1.0)
-        self.target = yy.real - np.abs(y) ** 2 / count
-        self.regressor = xx.real - np.abs(x) ** 2 / count
-        self.product = np.conj(yx - y * x / count)
-
-    @property
-    def explained(self) -> Floats:
-        """Share of the target's variance that the regressor explains, shape (G, L); 0 where one of them does not vary."""
-        varies = (self.target > _TINY) & (self.regressor > _TINY)
-        size = np.where(varies, self.target * self.regressor, 1.0)
-        return np.where(varies, np.minimum(np.abs(self.product) ** 2 / size, 1.0 - _TINY), 0.0)
-
-
-def sum_products(target: Signal, regressor: Signal, most: int, groups: int = 1) -> Plane:
-    """Return sums over a target y and a regressor x, shape (M,), by groups of time of equal length and lags up to ``most`` rows.
-
-    They are of 1, x, |x|², conj(y), conj(y) x and |y|² where both are known, shape (6, G, L).
-    """
-    length = target.size // groups
-    y = target[: groups * length].reshape(groups, length)
-    padded = np.pad(regressor, most, constant_values=np.nan)
-    x = np.lib.stride_tricks.sliding_window_view(padded, length + 2 * most)[: groups * length : length]
-    size = 1 << (length + 2 * most - 1).bit_length()
-    powers = ([known, np.where(known, each, 0.0)] for each in (y, x) for known in [np.isfinite(each)])
-    of_y, of_x = (np.fft.fft([known, each, np.abs(each) ** 2], size) for known, each in powers)
-    pairs = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0))
-    return np.stack([np.fft.ifft(np.conj(of_y[k]) * of_x[j])[:, 2 * most :: -1] for k, j in pairs])
-
-
 # Clocks that are nearly the same
 
 
@@ -265,9 +227,22 @@ def find_lag(target: Signal, regressor: Signal) -> Lag | None:
 
 
 def compute_lag_sums(target: Signal, regressor: Signal) -> Plane | None:
-    """Return what `estimate_lag` needs of a window, shape (6, G, L); parameters are `find_lag`'s. None where the window is too short."""
+    """Return sums over a target y and a regressor x of a window, shape (M,), by groups of time of equal length and lags.
+
+    They are of 1, x, |x|², conj(y), conj(y) x and |y|² where both are known, shape (6, G, L). None where the window is too short.
+    """
     groups = min(_GROUPS, int((target.size - 2 * _STEPS) * GRID_S / _MIN_GROUP_S))
-    return None if groups < _MIN_GROUPS else sum_products(target, regressor, _STEPS, groups)
+    if groups < _MIN_GROUPS:
+        return None
+    length = target.size // groups
+    y = target[: groups * length].reshape(groups, length)
+    padded = np.pad(regressor, _STEPS, constant_values=np.nan)
+    x = np.lib.stride_tricks.sliding_window_view(padded, length + 2 * _STEPS)[: groups * length : length]
+    size = 1 << (length + 2 * _STEPS - 1).bit_length()
+    powers = ([known, np.where(known, each, 0.0)] for each in (y, x) for known in [np.isfinite(each)])
+    of_y, of_x = (np.fft.fft([known, each, np.abs(each) ** 2], size) for known, each in powers)
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 0))
+    return np.stack([np.fft.ifft(np.conj(of_y[k]) * of_x[j])[:, 2 * _STEPS :: -1] for k, j in pairs])
 
 
 def estimate_lag(windows: Sequence[Plane]) -> Lag | None:
@@ -276,121 +251,75 @@ def estimate_lag(windows: Sequence[Plane]) -> Lag | None:
     together = -(-sums.shape[1] // (2 * _GROUPS))  # fewer, longer groups
     sums = np.add.reduceat(sums, np.arange(0, sums.shape[1], together), axis=1)
     sums = sums[:, (sums[0].real > 0.5).all(axis=1)]
-    groups = sums.shape[1]
-    if groups < _MIN_SPANS:
+    groups, total = sums.shape[1], sums.sum(axis=1, keepdims=True)
+    rows = total[0, 0].real if groups else np.zeros(1)
+    if groups < _MIN_GROUPS or rows.min() < 0.5 * rows.max() or rows.max() * GRID_S < _MIN_GROUP_S:
         return None
-    total = sums.sum(axis=1, keepdims=True)
-    whole, left_out = Products(total), Products(total - sums)
-    rows, explained = whole.rows[0], whole.explained[0]
-    if rows.min() < 0.5 * rows.max() or rows.max() * GRID_S < _MIN_GROUP_S:
+    # The whole first, then all but one group.
+    explained, factors = _explain_target(np.concatenate((total, total - sums), axis=1))
+    offsets_s, best = [GRID_S * _find_peak(each) for each in explained], int(np.argmax(explained[0]))
+    if not np.isfinite(offsets_s).all() or _has_rival(explained[0], best, float(rows.max()) / _INDEPENDENT):
         return None
-    best, independent = int(np.argmax(explained)), float(rows.max()) / _INDEPENDENT
-    offsets_s = [_find_peak_s(each) for each in (explained, *left_out.explained)]
-    if not np.isfinite(offsets_s).all() or _has_rival(explained, best, independent):
-        return None
-    jackknife_s = float(np.sqrt((groups - 1) * np.var(offsets_s[1:])))
-    std_s = max(jackknife_s, _compute_peak_std_s(explained, best, independent))
-    factor = complex(whole.product[0, best] / whole.regressor[0, best])
-    return Lag(offsets_s[0], std_s, float(explained[best]), factor)
+    std_s = float(np.sqrt((groups - 1) * np.var(offsets_s[1:])))
+    return Lag(offsets_s[0], std_s, float(explained[0, best]), complex(factors[0, best]))
 
 
-def find_turn(target: Plane, regressor: Plane, late_s: float) -> tuple[float, float, float] | None:
-    """Return by what angle a vector (M,) is turned against another, its standard deviation [rad], and the coherence (0 to 1)."""
-    sums = compute_lag_sums(target, regressor)
-    if sums is None:
-        return None
-    at = _STEPS + round(late_s / GRID_S)
-    total = sums.sum(axis=1, keepdims=True)
-    whole, left_out = Products(total), Products(total - sums)
-    angle = float(np.angle(whole.product[0, at]))
-    off = np.angle(left_out.product[:, at] * np.exp(-1j * angle))
-    return angle, float(np.sqrt((len(off) - 1) * np.mean(off**2))), float(np.sqrt(whole.explained[0, at]))
+def _explain_target(sums: Plane) -> tuple[Floats, Plane]:
+    """Return how much of a target's variance its regressor explains, 0 where one does not vary, and the factor, shape (G, L) each."""
+    n, x, xx, y, yx, yy = sums
+    count = np.maximum(np.rint(n.real), 1.0)
+    target, regressor = yy.real - np.abs(y) ** 2 / count, xx.real - np.abs(x) ** 2 / count
+    product = np.conj(yx - y * x / count)
+    varies = (target > _TINY) & (regressor > _TINY)
+    target, regressor = np.where(varies, target, 1.0), np.where(varies, regressor, 1.0)
+    explained = np.where(varies, np.minimum(np.abs(product) ** 2 / (target * regressor), 1.0 - _TINY), 0.0)
+    return explained, product / regressor
 
 
-def _find_peak_s(explained: Floats) -> float:
-    """Return the lag of the maximum [s], by a parabola through its neighbours; NaN at the end of the search and without one."""
-    best = int(np.argmax(explained))
-    if best in {0, explained.size - 1}:
+def _find_peak(values: Floats) -> float:
+    """Return the rows from the middle to the maximum, by a parabola through its neighbours; NaN at the end of the search."""
+    best = int(np.argmax(values))
+    if best in {0, values.size - 1}:
         return float("nan")
-    return (best - explained.size // 2 + _refine_peak(explained, best)) * GRID_S
-
-
-def _refine_peak(values: Floats, best: int) -> float:
-    """Return how many rows the top of the parabola through a maximum and its neighbours is later."""
     before, at, after = values[best - 1 : best + 2].tolist()
-    return float(0.5 * (after - before) / max(2.0 * at - before - after, _TINY))
-
-
-def _compute_peak_std_s(explained: Floats, best: int, independent: float) -> float:
-    """Return the standard deviation of a peak [s] by least squares: the noise that is left over the peak's curvature."""
-    before, at, after = explained[best - 1 : best + 2]
-    curvature = (2 * at - before - after) / GRID_S**2
-    return float(np.sqrt(2 * max(1.0 - at, 0.0) / (independent * curvature))) if curvature > 0 else np.inf
+    return float(best - values.size // 2 + 0.5 * (after - before) / max(2.0 * at - before - after, _TINY))
 
 
 def _has_rival(explained: Floats, best: int, independent: float) -> bool:
     """Return whether another peak is about as high: a motion that repeats itself shows no lag."""
-    peaks = _find_peaks(explained)
+    inner = explained[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= explained[:-2]) & (inner >= explained[2:]))
     others = explained[peaks[np.abs(peaks - best) > 1]]
     worse = independent * np.log((1.0 - others) / (1.0 - explained[best]))
-    return bool((worse < _MIN_CHI_SQUARED).any())
-
-
-def _find_peaks(values: Floats) -> NDArray[np.int64]:
-    """Return the rows of local maxima."""
-    inner = values[1:-1]
-    return 1 + np.flatnonzero((inner >= values[:-2]) & (inner >= values[2:]))
+    return bool((worse < 10.83).any())  # 99.9 % of χ² with one degree of freedom
 
 
 # Clocks that are seconds to minutes apart
 
-COARSE_S = 0.2
-"""Spacing of the rows of the coarse search [s]."""
-NEAR_S = MAX_LAG_S - COARSE_S
+_COARSE_S = 0.2  # spacing of the rows of the coarse search [s]
+NEAR_S = MAX_LAG_S - _COARSE_S
 """Largest lag that the fine search surely finds [s]."""
-_MOST = 1500  # largest lag that is searched [rows], 5 min
-_SMOOTH, _SLOW = 2, 75
-"""Half the rows over which signals are averaged, and about whose mean they are compared: 1 s and 30 s in all."""
-_MANOEUVRES = (0.15, 0.1)  # least size of a signal that varies [m/s], [rad/s]
-_MIN_ROWS = 450  # rows of the least overlap, 90 s
-_MIN_SCORE, _MIN_EXPLAINED = 18.0, 0.16
-"""Least log-likelihood ratio of the best lag, 6 σ: noise reaches 4 σ in 3,000 lags; and least share explained of one signal."""
-_APART, _MAX_RIVAL = 15, 0.5
-"""Rows between separate peaks, 3 s, and largest log-likelihood ratio of a row at another peak over that at the best [1]."""
 
 
 def prepare_coarse_signals(speed_mps: Floats, turn_radps: Floats) -> Floats:
-    """Return speed and turn rate for `find_coarse_lag`, shape (2, N): averaged, less the mean around each.
-
-    NaN throughout if a signal does not vary.
-    """
-    width, prepared = round(COARSE_S / GRID_S), []
-    for values, least in zip((speed_mps, turn_radps), _MANOEUVRES, strict=True):
-        rows = values[: values.size // width * width].reshape(-1, width).mean(1)
-        smooth = np.where(np.isfinite(rows), compute_moving_mean(rows, _SMOOTH, least=0.0), np.nan)
-        quick = smooth - compute_moving_mean(smooth, _SLOW, least=0.0)
-        varies = (np.abs(quick) > least).sum() > 2 * _SMOOTH + 1
-        prepared.append(quick if varies else np.full(quick.size, np.nan))
-    return np.stack(prepared)
+    """Return speed and turn rate for `find_coarse_lag`, shape (2, N): means over 1 s less those over 30 s, 0 where unknown."""
+    rows = np.stack((speed_mps, turn_radps))[:, : speed_mps.size // 10 * 10].reshape(2, -1, 10).mean(2).T
+    smooth = np.where(np.isfinite(rows), compute_moving_mean(rows, 2, least=0.0), np.nan)
+    quick: Floats = np.nan_to_num(smooth - compute_moving_mean(smooth, 75, least=0.0)).T
+    return quick
 
 
 def find_coarse_lag(late: Floats, against: Floats) -> float | None:
     """Return how much later the stamps of one sensor are than another's [s], None where this is unknown; signals of shape (2, N)."""
-    if late.shape[1] < _MIN_ROWS:
-        return None
-    pairs = [Products(sum_products(y, x, _MOST)) for y, x in zip(late, against, strict=True)]
-    # A short overlap, and one without motion, show nothing.
-    sizes = np.array([[pair.target[0], pair.regressor[0]] for pair in pairs])
-    varies = (sizes > 0.2 * np.median(sizes, axis=2, keepdims=True) + 1e-9).all(1)
-    rows = np.array([pair.rows[0] for pair in pairs])
-    known = varies & (rows >= _MIN_ROWS) & np.array([pair.product[0].real > 0.0 for pair in pairs])
-    explained = np.where(known, [pair.explained[0] for pair in pairs], 0.0)
-    log_ratio = -0.5 * np.log(1.0 - explained)
-    score, height = (rows * log_ratio).sum(0) / _INDEPENDENT, log_ratio.sum(0)
-    best = int(np.argmax(score))
-    if best in {0, 2 * _MOST} or score[best] < _MIN_SCORE or explained[:, best].max() < _MIN_EXPLAINED:
-        return None
-    is_rival = (np.abs(np.arange(height.size) - best) > _APART) & (height > _MAX_RIVAL * height[best])
-    if abs(best - _MOST) * COARSE_S > NEAR_S and is_rival.any():
-        return None
-    return (best - _MOST + _refine_peak(score, best)) * COARSE_S
+    most = round(300.0 / _COARSE_S)  # five minutes
+    size = 1 << (late.shape[1] + most).bit_length()
+    spectra = np.fft.rfft(late, size) * np.conj(np.fft.rfft(against, size))
+    power = np.sqrt(np.sum(late**2, axis=1) * np.sum(against**2, axis=1))
+    shares = np.fft.irfft(spectra, size) / np.maximum(power, _TINY)[:, None]
+    correlation = np.concatenate((shares[:, -most:], shares[:, : most + 1]), axis=1).sum(0)
+    best, lag_s = int(np.argmax(correlation)), _COARSE_S * _find_peak(correlation)
+    # Noise reaches 4 σ in 3,000 lags. Repeated lanes have several peaks that are about as high.
+    is_noise = float(correlation[best]) * np.sqrt(late.shape[1] / _INDEPENDENT) < 6.0
+    apart = np.abs(np.arange(correlation.size) - best) * _COARSE_S > 3.0
+    has_rival = abs(lag_s) > NEAR_S and float(correlation[apart].max()) > 0.7 * float(correlation[best])
+    return None if is_noise or np.isnan(lag_s) or has_rival else lag_s

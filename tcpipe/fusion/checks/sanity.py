@@ -9,7 +9,7 @@ Nothing else is decided before fusion: a section that its sensors do not explain
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -31,7 +31,6 @@ from tcpipe.fusion.checks.motions import (
     resample_signal,
     resample_twist,
 )
-from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
 from tcpipe.fusion.measurements import (
     DOPPLER,
     GNSS,
@@ -121,20 +120,19 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
     # 2. Turns of pairs; units and mounting of the IMU.
     rates = {role: twist[:, 1] for role, twist in twists.items()}
     rates |= {} if m.gnss is None else {GNSS: differentiate_course(compute_fix_velocity(m.gnss, at_ns))}
-    turn, yaws_rad = np.empty(0), dict[str, float]()
+    turn, level, yaws_rad = np.empty(0), np.eye(3), dict[str, float]()
     if m.imu is not None and IMU not in found:
         turn, force, level = resample_imu(m.imu, at_ns)
-        yaws_rad = _find_yaws(force, twists)
         rates = {IMU: turn, **rates}
-    # Over 2 s the noise of centimetres in fixes is below a turn, which is faster than 0.1 rad/s.
-    turns = _compare_signals({role: average(rate, 2.0) for role, rate in rates.items() if role not in found}, 0.1)
-    if turn.size:
-        wrong = _check_units(turn, [abs(ratio) for pair, ratio in turns.items() if IMU in pair], felt)
-        if wrong is None and m.imu is not None and m.imu.accelerometer_usable:
-            wrong = _check_mounting(level, yaws_rad)
-        if wrong is not None:
-            found[IMU], turn, yaws_rad = wrong, np.empty(0), {}
-            turns = {pair: ratio for pair, ratio in turns.items() if IMU not in pair}
+        yaws_rad = _find_yaws(force, twists) if m.imu.accelerometer_usable else {}
+    # Over 2 s the noise of centimetres in fixes is below a turn; the mean is the bias of a gyroscope.
+    smooth = {role: average(rate, 2.0) for role, rate in rates.items() if role not in found}
+    turns = _compare_signals(smooth, centred=True)
+    times = [abs(ratio) for pair, ratio in turns.items() if IMU in pair]
+    wrong = (_check_units(turn, times, felt) or _check_mounting(level, yaws_rad)) if turn.size else None
+    if wrong is not None:
+        found[IMU], turn, yaws_rad = wrong, np.empty(0), {}
+        turns = {pair: ratio for pair, ratio in turns.items() if IMU not in pair}
     # 3. Distances, by the turns of the gyroscope if there is one, and directions of pairs.
     for role, twist in twists.items() if turn.size else ():
         twist[:, 1] = np.where(np.isfinite(turn), turn, twist[:, 1])
@@ -144,8 +142,8 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
     forward = {role: twist[:, 0] for role, twist in twists.items()}
     if command is not None:
         forward[COMMAND] = hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns)
-    directions = _compare_signals(forward, MIN_SPEED_MPS)
-    directions |= {(role, IMU): cos for role, yaw in yaws_rad.items() if abs(cos := np.cos(yaw)) > _MIN_AGREEMENT}
+    directions = _compare_signals(forward)
+    directions |= {(role, IMU): float(np.cos(yaw)) for role, yaw in yaws_rad.items()}
     trust = {COMMAND: 1.0, IMU: float(is_imu_stated), WHEELS: 0.5, GNSS: 0.5, VISUAL: 0.25}
     _exclude(found, "distance", distances, {}, [pair for pair, ratio in turns.items() if ratio > 0.0])
     _exclude(found, "turn", turns, trust)
@@ -185,7 +183,7 @@ def _find_yaws(force: Plane, twists: Mapping[str, Floats]) -> dict[str, float]:
     return {role: float(np.angle(lag.factor)) for role, lag in lags.items() if lag and lag.explained > 0.1}
 
 
-def _check_units(turn: Floats, ratios: Collection[float], felt: float) -> SensorExclusion | None:
+def _check_units(turn: Floats, ratios: Sequence[float], felt: float) -> SensorExclusion | None:
     """Return the exclusion of an IMU in other units, by the yaw rates of others over its own, or its size, and the median force."""
     names, numbers = [], dict[str, float]()
     most_radps = float(np.nan_to_num(np.percentile(np.abs(turn[np.isfinite(turn)]), 99.5)))
@@ -204,7 +202,7 @@ def _check_mounting(level: Floats, yaws_rad: Mapping[str, float]) -> SensorExclu
     """Return the exclusion of an IMU that the rotation by which gravity levels it shows to be tilted, or accelerations to look aside."""
     tilt_rad = float(np.arccos(np.clip(level[2, 2], -1.0, 1.0)))
     by_gravity = tilt_rad > np.radians(30.0)  # slopes average out, and the steepest that is driven is 22.5°
-    is_aside = yaws_rad and all(abs(np.cos(each)) <= _MIN_AGREEMENT for each in yaws_rad.values())
+    is_aside = yaws_rad and all(abs(np.cos(each)) < 0.5 for each in yaws_rad.values())
     if not by_gravity and not is_aside:
         return None
     yaw_rad = next(iter(yaws_rad.values()), 0.0)
@@ -252,17 +250,22 @@ def compute_distance_ratio(a: Plane, b: Plane, noise_m2: float) -> float | None:
     return None
 
 
-_MIN_AGREEMENT = 0.5
-"""Least mean product of the signs of two signals that agree [1]: three of four rows."""
+_MIN_CORRELATION = 0.7
+"""Least correlation of two signals of one motion [1]: one explains half of the other."""
 
 
-def _compare_signals(signals: Mapping[str, Floats], least: float) -> Ratios:
-    """Return the ratios of signals on the grid (M,) where both are larger than ``least`` for 2 s, and mostly of one sign or of two."""
+def _compare_signals(signals: Mapping[str, Floats], *, centred: bool = False) -> Ratios:
+    """Return the factors between signals on the grid (M,) that correlate where both are known, ``centred`` without their means."""
     ratios = {}
-    for (a, x), (b, y) in combinations(signals.items(), 2):
-        rows = (np.abs(x) > least) & (np.abs(y) > least)
-        if rows.sum() * GRID_S >= 2.0 and abs(np.mean(np.sign(x[rows] * y[rows]))) > _MIN_AGREEMENT:
-            ratios[a, b] = float(np.median(y[rows] / x[rows]))
+    for a, b in combinations(signals, 2):
+        both = np.stack((signals[a], signals[b]))
+        both = both[:, np.isfinite(both).all(0)]
+        if both.shape[1] * GRID_S < 5.0:  # a few metres show nothing
+            continue
+        x, y = both - both.mean(axis=1, keepdims=True) if centred else both
+        power, product, other = (float(np.sum(each)) for each in (x * x, x * y, y * y))
+        if abs(product) > _MIN_CORRELATION * np.sqrt(power * other):
+            ratios[a, b] = product / power
     return ratios
 
 
