@@ -20,10 +20,6 @@ END_S = 5.0
 """Time at either end of a run in which fixes stay [s]: the track starts from them and ends at them."""
 LEAST_WINDOW_M = 1.0
 """Least distance of a window [m]: in a shorter one the robot is stationary."""
-_NOMINAL_SHARES = (0.6827, 0.9545)
-"""Shares of a normal distribution inside 1σ and 2σ [1]."""
-_MIN_WINDOWS, _TAIL = 5, 0.025
-"""Windows below which coverage is undecided: they can share one place or one fault; and each tail of a share's 95 % interval [1]."""
 
 Calibration = Literal["overconfident", "calibrated", "underconfident", "undecided"]
 
@@ -66,18 +62,17 @@ class WithheldScore:
 
 def score_comparisons(comparisons: Sequence[Comparison]) -> WithheldScore:
     """Return the score of comparisons of one length, of one run or of several."""
-    error_m = np.concatenate([np.linalg.norm(each.error_m, axis=1) for each in comparisons])
-    std_m = np.concatenate([np.linalg.norm(each.std_m, axis=1) for each in comparisons])
-    normalized = np.concatenate([np.abs(each.error_m / each.std_m) for each in comparisons])
+    error_m, std_m = (np.concatenate([getattr(each, name) for each in comparisons]) for name in ("error_m", "std_m"))
+    normalized, sizes_m = np.abs(error_m / std_m), np.linalg.norm(error_m, axis=1)
     windows = sum(len(np.unique(each.window)) for each in comparisons)
     within = (float(np.mean(normalized < 1.0)), float(np.mean(normalized < 2.0)))
     return WithheldScore(
         window_s=comparisons[0].window_s,
         windows=windows,
         compared=len(error_m),
-        median_error_m=float(np.median(error_m)),
-        p95_error_m=float(np.quantile(error_m, 0.95)),
-        median_std_m=float(np.median(std_m)),
+        median_error_m=float(np.median(sizes_m)),
+        p95_error_m=float(np.quantile(sizes_m, 0.95)),
+        median_std_m=float(np.median(np.linalg.norm(std_m, axis=1))),
         within_1_sigma=within[0],
         within_2_sigma=within[1],
         calibration=_judge_coverage(within, windows),
@@ -85,12 +80,13 @@ def score_comparisons(comparisons: Sequence[Comparison]) -> WithheldScore:
 
 
 def _judge_coverage(within: tuple[float, float], windows: int) -> Calibration:
-    if windows < _MIN_WINDOWS:
+    """Compare the shares inside 1σ and 2σ with those of a normal distribution; few windows can share one place or one fault."""
+    if windows < 5:
         return "undecided"
     count_1, count_2 = (share * windows for share in within)
-    if count_2 < windows and betaincinv(count_2 + 1.0, windows - count_2, 1.0 - _TAIL) < _NOMINAL_SHARES[1]:
+    if count_2 < windows and betaincinv(count_2 + 1.0, windows - count_2, 0.975) < 0.9545:
         return "overconfident"
-    is_low = count_1 > 0.0 and betaincinv(count_1, windows - count_1 + 1.0, _TAIL) > _NOMINAL_SHARES[0]
+    is_low = count_1 > 0.0 and betaincinv(count_1, windows - count_1 + 1.0, 0.025) > 0.6827
     return "underconfident" if is_low else "calibrated"
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from tcpipe.fusion.checks.clock_offsets import (
     find_clock_offsets,
-    find_middle_ns,
     find_other_clocks,
     shift_sensors,
 )
@@ -78,7 +78,8 @@ def find_clocks(sections: Sequence[Section]) -> list[Section]:
     shown: dict[str, tuple[ClockOffset, str, int]] = {}
     for place in rank_sections(sections):
         m = sections[place].measurements
-        clocks, middle_ns = find_clock_offsets(m, clock_epoch=sections[place].clock_epoch), find_middle_ns(m)[0]
+        clocks = find_clock_offsets(m, clock_epoch=sections[place].clock_epoch)
+        middle_ns = sum(sections[place].span_ns) // 2
         own = {role: (offset, clocks.reference, middle_ns) for role, offset in clocks.offsets.items() if offset.noted}
         for role in sorted(shown.keys() & m.sensors().keys() - clocks.offsets.keys() - {clocks.reference}):
             offset, reference, at_ns = shown[role]
@@ -95,7 +96,7 @@ def correct_clocks(sections: Sequence[Section], streams: Streams) -> list[Sectio
     """Return the sections on one clock each: offset and drift of each clock, about the middle of its section, are taken out."""
     corrected, stated_s = [], streams.report.facts.time_offset_s.get(GNSS, 0.0)
     for section in sections:
-        middle_ns = find_middle_ns(section.measurements)[0]
+        middle_ns = sum(section.span_ns) // 2
         shifted = shift_sensors(section.measurements, section.offsets, middle_ns)
         if shifted.gnss is not None:
             found_s = section.offsets[GNSS].offset_s if GNSS in section.offsets else 0.0
@@ -119,25 +120,16 @@ def find_offsets(sections: Sequence[Section], streams: Streams) -> list[Finding]
 def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Streams, span_s: float) -> Finding:
     """Return the finding on a clock: which is off where two others agree, else that two differ."""
     compared = dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against})
-    subject, names = Subject("role", role), {"reference": found.reference, "by": ", ".join(compared)}
-    offset_s, offset_2std_s, drift_s = offset.offset_s, 2 * offset.std_s, 1e-6 * offset.drift_ppm * span_s
+    names, drift_s = {"reference": found.reference, "by": ", ".join(compared)}, 1e-6 * offset.drift_ppm * span_s
+    numbers: dict[str, Any] = {"offset_s": offset.offset_s, "offset_2std_s": 2 * offset.std_s}
     if not offset.blamed:
-        return make_finding(
-            "clocks-differ", subject, names=names, offset_s=offset_s, offset_2std_s=offset_2std_s, drift_s=drift_s
-        )
+        return make_finding("clocks-differ", Subject("role", role), names=names, drift_s=drift_s, **numbers)
+    code, remedies = "time-offset", _state_offset(role, offset, streams)
     if offset.drift_ppm:
+        code, numbers = "clock-drift", {"drift_s": drift_s}
         by_log = streams.sensors[role].time_source == "log"
         remedies = () if by_log else suggest("use_log_time", {"read.time_source": {role: "log"}})
-        return make_finding("clock-drift", subject, action="corrected", names=names, remedies=remedies, drift_s=drift_s)
-    return make_finding(
-        "time-offset",
-        subject,
-        action="corrected",
-        names=names,
-        remedies=_state_offset(role, offset, streams),
-        offset_s=offset_s,
-        offset_2std_s=offset_2std_s,
-    )
+    return make_finding(code, Subject("role", role), action="corrected", names=names, remedies=remedies, **numbers)
 
 
 def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Remedy, ...]:

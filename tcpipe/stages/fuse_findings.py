@@ -9,7 +9,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Positions
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS
 from tcpipe.geometry.rotation import (
     matrix_from_quat,
     multiply,
@@ -31,9 +31,6 @@ from tcpipe.tables.facts import (
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
 
-_CERTAIN_YAW_SOURCES = ("course over ground", "pose")
-"""Sources of the initial yaw that need no finding."""
-
 
 def make_fuse_facts(
     inputs: Sequence[Section], sections: Sequence[StretchFacts], *, rows: int, skipped_s: float
@@ -42,10 +39,11 @@ def make_fuse_facts(
     roles = sorted({role for section in sections for role in section.measurements})
     nis: dict[str, float | None] = {}
     for role in roles:
-        means = [(s.nis_mean.get(role), s.measurements[role]) for s in sections if role in s.measurements]
-        known = [(mean, count) for mean, count in means if mean is not None]
+        of_role = [(each.nis_mean.get(role), each.measurements.get(role, 0)) for each in sections]
+        known = [(mean, count) for mean, count in of_role if mean is not None]
         if known:
-            nis[role] = float(np.average([mean for mean, _ in known], weights=[count for _, count in known]))
+            means, counts = zip(*known, strict=True)
+            nis[role] = float(np.average(means, weights=counts))
     return FuseFacts(
         rows=rows,
         sensors=tuple(sorted({role for section in sections for role in section.sensors})),
@@ -73,24 +71,16 @@ def add_counts(inputs: Sequence[Section]) -> dict[str, dict[str, int]]:
 
 def find_fuse_findings(inputs: Sequence[Section], facts: FuseFacts, *, run: Subject) -> tuple[Finding, ...]:
     """Return what was observed while fusing."""
-    gnss, first_ns = Subject("role", GNSS), min((section.start_ns for section in facts.stretches), default=0)
+    first_ns = min((section.start_ns for section in facts.stretches), default=0)
     unused = set.intersection(*(set(section.excluded) for section in inputs))
     every = (finding for section in inputs for finding in section.findings)
     findings = [*dict.fromkeys(finding for finding in every if finding.subject.name not in unused)]
-    is_local = all(section.datum_deg_m is None for section in inputs)
-    if is_local and GNSS in facts.set_aside:  # a log without any fix was found when it was read
-        findings.append(make_finding("local-frame", gnss))
-    elif not is_local:
-        findings += [
-            _find_initial_yaw(section, first_ns, gnss)
-            for section in facts.stretches
-            if section.heading_from not in _CERTAIN_YAW_SOURCES
-        ]
-    findings += _find_reopenings(facts, first_ns)
-    findings += _find_changes(facts, first_ns)
-    findings += _find_unlikely_changes(facts, first_ns, run)
-    findings += _find_scale(facts)
-    findings += _find_rejections(facts)
+    # A log without any fix was found when it was read.
+    if GNSS in facts.set_aside and all(section.datum_deg_m is None for section in inputs):
+        findings.append(make_finding("local-frame", Subject("role", GNSS)))
+    findings += _find_gate_resets(facts, first_ns)
+    findings += _find_changes(facts, first_ns, run)
+    findings += _find_weak_sensors(facts)
     for key, code in (("variances_replaced", "variances-replaced"), ("invalid", "values-unusable")):
         findings += [
             make_finding(code, Subject("role", role), row_count=count[key])
@@ -102,34 +92,44 @@ def find_fuse_findings(inputs: Sequence[Section], facts: FuseFacts, *, run: Subj
     return tuple(findings)
 
 
-def _find_initial_yaw(section: StretchFacts, first_ns: int, gnss: Subject) -> Finding:
-    span_s = _find_span_s(section, first_ns)
-    return make_finding("initial-yaw-uncertain", gnss, span_s=span_s, names={"source": section.heading_from})
+def _find_gate_resets(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
+    """Yield by sensor how often it contradicted the others for seconds, and where most."""
+    gate_resets = [gate_reset for section in facts.stretches for gate_reset in section.gate_resets]
+    odometries = [role for role in (WHEELS, VISUAL) if role in facts.sensors]
+    for role in sorted({gate_reset.role for gate_reset in gate_resets}):
+        of_role = [gate_reset for gate_reset in gate_resets if gate_reset.role == role]
+        worst = max(of_role, key=lambda gate_reset: gate_reset.size)
+        is_fix = role == GNSS
+        code, off = ("gnss-contradicts-odometry", "off_m") if is_fix else ("odometry-contradicts-others", "off_mps")
+        suspect = {"suspect": odometries[0]} if is_fix and len(odometries) == 1 else {}
+        numbers: dict[str, Any] = {off: worst.size, "event_count": len(of_role)}
+        yield make_finding(code, Subject("role", role), span_s=_find_span_s(worst, first_ns), names=suspect, **numbers)
 
 
-def _find_scale(facts: FuseFacts) -> list[Finding]:
-    """Return the finding that nothing shows well how long a metre of odometry is."""
+def _find_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Finding]:
+    """Yield what explains contradictions of sensors, when, and by how much they were off; and the sections that need many changes."""
+    changes = (each for section in facts.stretches for each in section.changes if each.kind in CHANGES)
+    for change in sorted(changes, key=lambda each: each.start_ns):
+        names, span_s = {"change": CHANGES[change.kind].format(change.size)}, _find_span_s(change, first_ns)
+        yield make_finding("sensor-changed", Subject("role", change.role), span_s=span_s, names=names)
+    for section in facts.stretches:
+        count = section.count_changes()
+        if count > read_threshold("changes-unlikely", "max_change_count"):
+            yield make_finding("changes-unlikely", run, span_s=_find_span_s(section, first_ns), change_count=count)
+
+
+def _find_weak_sensors(facts: FuseFacts) -> Iterator[Finding]:
+    """Yield the odometry whose scale nothing shows well, and the sensors of which many measurements are rejected."""
     std = max((section.common_scale_std or 0.0 for section in facts.stretches), default=0.0)
-    if std <= read_threshold("odometry-scale-unobservable", "min_scale_std_fraction"):
-        return []
-    role = WHEELS if WHEELS in facts.sensors or VISUAL not in facts.sensors else VISUAL
-    names = {"reason": "coarse-gnss" if GNSS in facts.sensors else "no-gnss"}
-    subject = Subject("role", role)
-    return [make_finding("odometry-scale-unobservable", subject, names=names, scale_std_fraction=std)]
-
-
-_MOTION = {GNSS, WHEELS, VISUAL}
-"""Sensors of which one is needed: without any there is no track."""
-
-
-def _find_rejections(facts: FuseFacts) -> list[Finding]:
-    most = read_threshold("measurements-rejected", "max_rejected_fraction")
-    findings = []
+    if std > read_threshold("odometry-scale-unobservable", "min_scale_std_fraction"):
+        role = WHEELS if WHEELS in facts.sensors or VISUAL not in facts.sensors else VISUAL
+        names = {"reason": "coarse-gnss" if GNSS in facts.sensors else "no-gnss"}
+        yield make_finding("odometry-scale-unobservable", Subject("role", role), names=names, scale_std_fraction=std)
     for role, count in facts.measurements.items():
         rejected = facts.rejected[role]
-        if rejected > most * count:
-            is_alone = not _MOTION.intersection(facts.sensors).difference({role})
-            finding = make_finding(
+        if rejected > read_threshold("measurements-rejected", "max_rejected_fraction") * count:
+            is_alone = {GNSS, WHEELS, VISUAL}.intersection(facts.sensors) <= {role}  # without any there is no track
+            yield make_finding(
                 "measurements-rejected",
                 Subject("role", role),
                 remedies=() if is_alone else exclude_role(role),
@@ -137,44 +137,6 @@ def _find_rejections(facts: FuseFacts) -> list[Finding]:
                 rejected_count=rejected,
                 measurement_count=count,
             )
-            findings.append(finding)
-    return findings
-
-
-def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
-    """Return by sensor how often it contradicted the others for seconds, and where most."""
-    findings = []
-    gate_resets = [gate_reset for section in facts.stretches for gate_reset in section.gate_resets]
-    odometries = [role for role in (WHEELS, VISUAL) if role in facts.sensors]
-    for role in sorted({gate_reset.role for gate_reset in gate_resets}):
-        of_role = [gate_reset for gate_reset in gate_resets if gate_reset.role == role]
-        worst = max(of_role, key=lambda gate_reset: gate_reset.size)
-        subject, span_s = Subject("role", role), _find_span_s(worst, first_ns)
-        code, off = (
-            ("gnss-contradicts-odometry", "off_m") if role == GNSS else ("odometry-contradicts-others", "off_mps")
-        )
-        suspect = {"suspect": odometries[0]} if role == GNSS and len(odometries) == 1 else {}
-        numbers: dict[str, Any] = {off: worst.size, "event_count": len(of_role)}
-        findings.append(make_finding(code, subject, span_s=span_s, names=suspect, **numbers))
-    return findings
-
-
-def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
-    """Yield what explains contradictions of sensors: what changed, when, and by how much fixes were off."""
-    changes = (each for section in facts.stretches for each in section.changes if each.kind in CHANGES)
-    for change in sorted(changes, key=lambda each: each.start_ns):
-        subject = Subject("role", change.role)
-        names, span_s = {"change": CHANGES[change.kind].format(change.size)}, _find_span_s(change, first_ns)
-        yield make_finding("sensor-changed", subject, span_s=span_s, names=names)
-
-
-def _find_unlikely_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Finding]:
-    """Yield the finding of each section that needs more changes than are likely."""
-    most = read_threshold("changes-unlikely", "max_change_count")
-    for section in facts.stretches:
-        count = section.count_changes()
-        if count > most:
-            yield make_finding("changes-unlikely", run, span_s=_find_span_s(section, first_ns), change_count=count)
 
 
 CHANGES = {
@@ -198,10 +160,6 @@ def _find_span_s(each: StretchFacts | GateReset | ChangeFacts, first_ns: int) ->
     return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
 
 
-_LEAST_ARM_M, _LEAST_TILT_RAD, _LEAST_TURN_RAD, _LEAST_SCALE = 0.1, 0.0175, 0.05, 0.1
-"""Least errors that are findings: of a lever arm [m], the tilt of an IMU (1°), the rotation of a pose [rad], a scale [1] (rulings)."""
-
-
 def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams: Streams) -> Iterator[Finding]:
     """Yield where the longest track section shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
     longest = facts.longest
@@ -209,20 +167,20 @@ def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams
     arm, tilt = parameters.get("antenna"), parameters.get("mounting of the IMU")
     if arm is not None and GNSS in streams.sensors:
         sensor, turned = streams.sensors[GNSS], parameters.get("mounting of the pose")
-        turn = _find_rotation(turned, _find_fixes(inputs, longest), sensor)
-        if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
+        turn = _find_rotation(turned, inputs, longest, sensor)
+        if sensor.placed_by == "assumed" or _is_contradicted(arm, 0.1):
             yield _find_arm(arm, sensor, turn)
         off = quat_from_matrix(turn @ matrix_from_quat(sensor.quat_xyzw).T)
         off_rad = float(np.linalg.norm(rotation_vector_from_quat(off)))
         unsure_rad = 0.0 if turned is None else float(np.linalg.norm(turned.std))
-        if sensor.placed_by != "assumed" and off_rad > max(MIN_SIGMAS * unsure_rad, _LEAST_TURN_RAD):
+        if sensor.placed_by != "assumed" and off_rad > max(MIN_SIGMAS * unsure_rad, 0.05):
             remedies, names = state_extrinsics(GNSS, sensor.xyz_m, turn), {"placed_by": sensor.placed_by}
             yield make_finding("pose-rotated", Subject("role", GNSS), names=names, remedies=remedies, off_rad=off_rad)
-    if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
+    if tilt is not None and _is_contradicted(tilt, np.radians(1.0)):
         yield _find_tilt(tilt, streams.sensors[IMU])
     for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):
         found = parameters.get(name)
-        if found is not None and _is_contradicted(found, _LEAST_SCALE):
+        if found is not None and _is_contradicted(found, 0.1):
             scale, std = 1.0 + found.value[0], found.std[0]
             stated = (streams.report.facts.odometry_scale or {}).get(role, 1.0)
             remedies = suggest("state", {"read.odometry_scale": {role: round(stated / scale, 4)}})
@@ -237,18 +195,16 @@ def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams
 
 
 def _is_contradicted(found: ParameterFacts, least: float) -> bool:
-    """Return whether a parameter surely differs from what is stated, by so much at least."""
+    """Return whether a parameter surely differs from what is stated, by ``least`` [m], [rad] or [1] at least."""
     return any(abs(v) > max(MIN_SIGMAS * s, least) for v, s in zip(found.value, found.std, strict=True))
 
 
-def _find_fixes(inputs: Sequence[Section], part: StretchFacts) -> Positions | None:
-    """Return the fixes of the section that contains a track section."""
-    fixes = (section.measurements.gnss for section in inputs if section.clock_epoch == part.clock_epoch)
-    return next((each for each in fixes if each is not None and each.stamp_ns[-1] >= part.start_ns), None)
-
-
-def _find_rotation(turned: ParameterFacts | None, fixes: Positions | None, sensor: Sensor) -> NDArray[np.float64]:
+def _find_rotation(
+    turned: ParameterFacts | None, inputs: Sequence[Section], part: StretchFacts, sensor: Sensor
+) -> NDArray[np.float64]:
     """Return how the sensor of positions is turned on the robot, shape (3, 3): that of a pose as its run shows it."""
+    of_epoch = (each.measurements.gnss for each in inputs if each.clock_epoch == part.clock_epoch)
+    fixes = next((each for each in of_epoch if each is not None and each.stamp_ns[-1] >= part.start_ns), None)
     if turned is None or fixes is None:
         return matrix_from_quat(sensor.quat_xyzw)
     return matrix_from_quat(multiply(quat_from_rotation_vector(turned.value), fixes.mounting_xyzw))

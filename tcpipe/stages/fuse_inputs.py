@@ -46,7 +46,7 @@ from tcpipe.tables.levels import Sensor, Streams
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One clock epoch of a run, or a part of it without a pause of `_PAUSE_NS`, and everything that is decided about its sensors.
+    """One clock epoch of a run, or a part of it without a pause of an hour, and everything that is decided about its sensors.
 
     Units and mounting are constants of the robot: a section also has those that sections with a longer drive show. Everything else is
     decided in each section alone.
@@ -93,10 +93,6 @@ def rank_sections(sections: Sequence[Section]) -> list[int]:
     return sorted(range(len(sections)), key=lambda place: -sections[place].driven_m)
 
 
-_PAUSE_NS = 3_600_000_000_000
-"""Pause of all sensors after which a section ends [ns]: a log may begin in 1970, and grids over an hour are small."""
-
-
 def prepare_sections(streams: Streams, config: FuseConfig) -> list[Section]:
     """Return the measurements of each clock epoch, in order of epoch and time, without those that have no usable value."""
     tables = {role: streams.tables[role] for role in (GNSS, DOPPLER, IMU, WHEELS, VISUAL) if role in streams.tables}
@@ -107,7 +103,11 @@ def prepare_sections(streams: Streams, config: FuseConfig) -> list[Section]:
     sections = []
     for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["clock_epoch"]).to_pylist()}):
         parts = {role: select_rows(table, "clock_epoch", epoch) for role, table in tables.items()}
-        command = read_command(streams, epoch)
+        command = None
+        if "command" in streams.tables:
+            table = select_rows(streams.tables["command"], "clock_epoch", epoch)
+            values = (to_floats(table, name) for name in ("forward_velocity_mps", "yaw_rate_radps"))
+            command = Command(to_integers(table, "stamp_ns"), *values)
         for part in _split_at_pauses(parts):
             section = _prepare_section(part, streams, config, datum)
             sections.append(replace(section, clock_epoch=epoch, command=command))
@@ -115,9 +115,10 @@ def prepare_sections(streams: Streams, config: FuseConfig) -> list[Section]:
 
 
 def _split_at_pauses(parts: Mapping[str, pa.Table]) -> Iterator[dict[str, pa.Table]]:
+    """Yield parts of tables between pauses of an hour: a log may begin in 1970, and grids over an hour are small."""
     stamps = {role: to_integers(part, "stamp_ns") for role, part in parts.items()}
     every = np.unique(np.concatenate([*stamps.values()]))
-    first = np.concatenate((every[:1], every[1:][np.diff(every) > _PAUSE_NS], every[-1:] + 1))
+    first = np.concatenate((every[:1], every[1:][np.diff(every) > 3_600_000_000_000], every[-1:] + 1))
     for start, end in pairwise(first.tolist()):
         bounds = {role: np.searchsorted(stamp, (start, end)).tolist() for role, stamp in stamps.items()}
         yield {role: parts[role].slice(first, last - first) for role, (first, last) in bounds.items() if last > first}
@@ -196,23 +197,24 @@ def _prepare(
     )
 
 
-_STATED = ("recipe", "tf_static", "same frame")
-
-
 def drop_implausible_sensors(sections: Sequence[Section], streams: Streams) -> list[Section]:
     """Return the sections without the sensors that cannot be right.
 
     Sections are judged from the longest drive to the shortest. Each one decides about its own sensors, after it has taken over the
     constants of the robot that those before it have shown: a few metres do not show the sign of a yaw rate.
     """
-    is_imu_stated = IMU in streams.sensors and streams.sensors[IMU].placed_by in _STATED
-    felt = _compute_median_specific_force(streams)
+    stated = ("recipe", "tf_static", "same frame")
+    is_imu_stated = IMU in streams.sensors and streams.sensors[IMU].placed_by in stated
+    felt_mps2 = float("nan")
+    if IMU in streams.tables:
+        force = np.stack([to_floats(streams.tables[IMU], f"linear_acceleration_{axis}_mps2") for axis in "xyz"], -1)
+        felt_mps2 = float(np.median(np.linalg.norm(force, axis=1)))
     judged = list(sections)
     constants: dict[str, SensorExclusion] = {}
     for place in rank_sections(sections):
         roles = sections[place].measurements.sensors()
         section = exclude_sensors(sections[place], [constants[role] for role in constants if role in roles], streams)
-        found = check_sensors(section.measurements, section.command, is_imu_stated=is_imu_stated, felt=felt)
+        found = check_sensors(section.measurements, section.command, is_imu_stated=is_imu_stated, felt=felt_mps2)
         section = exclude_sensors(section, found.values(), streams)
         doubt = check_ground_velocity(section.measurements)
         judged[place] = exclude_sensors(section, [] if doubt is None else [doubt], streams)
@@ -245,23 +247,6 @@ def _define_base_by_antenna(section: Section, streams: Streams) -> Section:
     return replace(section, measurements=m.replace_sensors({GNSS: gnss}), findings=(*section.findings, found))
 
 
-def read_command(streams: Streams, epoch: int) -> Command | None:
-    """Return the commands of a clock epoch; None without."""
-    if "command" not in streams.tables:
-        return None
-    table = select_rows(streams.tables["command"], "clock_epoch", epoch)
-    values = (to_floats(table, name) for name in ("forward_velocity_mps", "yaw_rate_radps"))
-    return Command(to_integers(table, "stamp_ns"), *values)
-
-
-def _compute_median_specific_force(streams: Streams) -> float:
-    """Return the median size of the specific force."""
-    if IMU not in streams.tables:
-        return float("nan")
-    force = np.stack([to_floats(streams.tables[IMU], f"linear_acceleration_{axis}_mps2") for axis in "xyz"], -1)
-    return float(np.median(np.linalg.norm(force, axis=1)))
-
-
 def _find_exclusion(exclusion: SensorExclusion, section: Section, streams: Streams) -> Finding:
     """Return the finding of a sensor that is not fused; a receiver's velocity helps fixes that are fused, and no label needs it."""
     sensor, name = streams.sensors[exclusion.role], exclusion.role
@@ -274,7 +259,6 @@ def _find_exclusion(exclusion: SensorExclusion, section: Section, streams: Strea
         remedies = suggest("state_scale", {"read.odometry_scale": {name: round(stated / exclusion.scale, 4)}})
     else:
         remedies = exclude_role(name)
-    numbers: Mapping[str, Any] = exclusion.numbers
     stamp_ns = section.measurements.sensors()[name].stamp_ns
     return make_finding(
         exclusion.code,
@@ -284,13 +268,13 @@ def _find_exclusion(exclusion: SensorExclusion, section: Section, streams: Strea
         severity="note" if exclusion.role == DOPPLER else None,
         names={"topic": sensor.topic, "placed_by": sensor.placed_by, **exclusion.names},
         remedies=remedies,
-        **numbers,
+        **exclusion.numbers,
     )
 
 
-def exclude_role(name: str, remedy: str = "exclude") -> tuple[Remedy, ...]:
+def exclude_role(name: str) -> tuple[Remedy, ...]:
     """Return what excludes a role, whichever topic is used as it and whoever chose that."""
-    return suggest(remedy, {"read.topics": {name: []}})
+    return suggest("exclude", {"read.topics": {name: []}})
 
 
 def state_extrinsics(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64]) -> tuple[Remedy, ...]:

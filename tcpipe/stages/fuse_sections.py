@@ -62,7 +62,9 @@ def fuse_section(section: Section, streams: Streams, config: FuseConfig, last: T
             fused.skipped_s += (part.end_ns - part.start_ns) * 1e-9
             continue
         # 1. Its initial state.
-        initial = _make_initial_state(part, last if section.datum_deg_m is None else None)
+        initial = find_initial_state(m, find_stationary_intervals(m), part.start_ns)
+        if last is not None and section.datum_deg_m is None:
+            initial = replace(initial, position_enu_m=last.position_enu_m[-1], quat_xyzw=last.quat_xyzw[-1])
         # 2. Filter and smoother.
         trajectory = _estimate(part, initial, output_ns, config)
         if m.gnss is not None and m.is_antenna_alone:
@@ -77,28 +79,14 @@ def fuse_section(section: Section, streams: Streams, config: FuseConfig, last: T
     return fused
 
 
-def _make_initial_state(section: TrackSection, last: Trajectory | None) -> InitialState:
-    m = section.measurements
-    initial = find_initial_state(m, find_stationary_intervals(m), section.start_ns)
-    if last is None:
-        return initial
-    return replace(initial, position_enu_m=last.position_enu_m[-1], quat_xyzw=last.quat_xyzw[-1])
-
-
 def _estimate(
     section: TrackSection, initial: InitialState, output_ns: NDArray[np.int64], config: FuseConfig
 ) -> Trajectory:
-    gate = config.gate_probability
     if config.estimator == "ukf":
-        from tcpipe.fusion.ukf15 import run_ukf15  # noqa: PLC0415  filterpy takes a second to load
-
-        return run_ukf15(section.measurements, initial, output_ns=output_ns, gate_probability=gate)
-    return run_error_state(section.measurements, initial, output_ns=output_ns, gate_probability=gate)
-
-
-_SHOWN_M = 0.2
-"""Least length of a drive that shows its direction [m]: shorter ones may be noise of a stationary robot."""
-_HALF_TURN = np.array([0.0, 0.0, 1.0, 0.0])
+        from tcpipe.fusion.ukf15 import run_ukf15 as run  # noqa: PLC0415  filterpy takes a second to load
+    else:
+        run = run_error_state
+    return run(section.measurements, initial, output_ns=output_ns, gate_probability=config.gate_probability)
 
 
 def assume_forward(
@@ -111,10 +99,10 @@ def assume_forward(
     """
     rotation, velocity = matrix_from_quat(found.quat_xyzw), found.velocity_enu_mps
     ahead_mps = np.sum(rotation[:, :, 0] * velocity, axis=1) * np.where(commanded_mps < 0.0, -1.0, 1.0)
-    # Rows up to the next change of sign are one drive; short ones keep the direction of the one before.
+    # Rows up to the next change of sign are one drive; those below 0.2 m, which may be noise, keep the direction of the one before.
     drive = np.cumsum(np.diff(np.sign(ahead_mps), prepend=0.0) != 0.0)
     driven_m = np.bincount(drive, np.abs(ahead_mps)) * compute_median_period_ns(found.stamp_ns) * 1e-9
-    shown = np.flatnonzero(driven_m[drive] > _SHOWN_M)
+    shown = np.flatnonzero(driven_m[drive] > 0.2)
     if not shown.size:
         return found
     last = np.searchsorted(shown, np.arange(drive.size), "right") - 1
@@ -124,7 +112,7 @@ def assume_forward(
     return replace(
         found,
         position_enu_m=found.position_enu_m + turned * (rotation @ moved_m),
-        quat_xyzw=np.where(turned, multiply(found.quat_xyzw, _HALF_TURN), found.quat_xyzw),
+        quat_xyzw=np.where(turned, multiply(found.quat_xyzw, np.array([0.0, 0.0, 1.0, 0.0])), found.quat_xyzw),
         velocity_enu_mps=velocity + turned * np.einsum("nij,nj->ni", rotation, moved_mps),
         angular_velocity_radps=found.angular_velocity_radps * np.where(turned, [-1.0, -1.0, 1.0], 1.0),
     )

@@ -3,12 +3,11 @@
 Small offsets are states of the estimator, and steps of a clock are hypotheses of it. Larger offsets are found before fusion. Two signals of
 one motion are shifted against each other until one explains most of the other (`motions`): yaw rates, speeds, accelerations.
 They are compared only where the robot turns or changes its speed: on a straight there is nothing to compare but what the controller
-corrects, and that leads the body. The course of the fixes is not compared with the gyroscope: an antenna that sits ahead of the turning
-point by l leads the body's course by l / v, 0.1 s for 10 cm.
+corrects, and that leads the body. The course of fixes is not compared with the gyroscope: an antenna ahead of the turning point by l leads
+the body's course by l / v, 0.1 s for 10 cm.
 
 The pairs together, in windows of at most ten minutes, give each sensor's offset and drift from the clock that most of them share. A
-sensor is blamed only where two others agree against it and no pair contradicts; else two differ, and it is unknown which is wrong. Clocks
-that are up to five minutes apart are found first, by the coarse search.
+sensor is blamed only where two others agree against it and no pair contradicts. Clocks up to five minutes apart are found first.
 """
 
 from __future__ import annotations
@@ -69,7 +68,8 @@ _COARSE_STD_S = 0.1  # standard deviation of an offset by the coarse search [s]
 
 def find_clock_offsets(m: Measurements, *, clock_epoch: int = 0) -> ClockFacts:
     """Return the offsets between the stamps of a clock epoch's sensors."""
-    middle_ns, span_s = find_middle_ns(m)
+    first_ns, last_ns = find_span_ns(m) or (0, 0)
+    middle_ns, span_s = (first_ns + last_ns) // 2, (last_ns - first_ns) * 1e-9
     evidence: dict[tuple[str, str, str], list[tuple[float, Plane]]] = {}
     for at_ns in iterate_windows_ns(m, round(np.clip(0.2e9 * span_s, *_WINDOW_NS))):
         inside = select_measurements(m, int(at_ns[0]), int(at_ns[-1]))
@@ -80,12 +80,6 @@ def find_clock_offsets(m: Measurements, *, clock_epoch: int = 0) -> ClockFacts:
                 evidence.setdefault((late, against, by), []).append((at_s, sums))
     pairs = [pair for names, windows in evidence.items() for pair in _list_pairs(*names, windows)]
     return solve_offsets(pairs, clock_epoch, span_s)
-
-
-def find_middle_ns(m: Measurements) -> tuple[int, float]:
-    """Return the middle of a set's measurements [ns], and how long they last [s]; 0 without any."""
-    first_ns, last_ns = find_span_ns(m) or (0, 0)
-    return (first_ns + last_ns) // 2, (last_ns - first_ns) * 1e-9
 
 
 def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, ClockOffset]:

@@ -2,13 +2,9 @@
 
 The time offset of one signal against another, and the factor between them, come from their correlation at every lag.
 Signals are real, or complex for vectors in the plane, NaN where unknown: masked normalised cross-correlation by FFT (Padfield, CVPR 2010).
-The lag at which one signal explains most of the other's variance is the offset, refined by a parabola.
-
-The fine search, over a second, is by groups of time. Its standard deviation is the larger of two: that of least squares, and that of the
-delete-a-group jackknife (Miller 1974, Biometrika 61), which needs no model of the residuals. The coarse search, over minutes, is by speed
-and turn rate together; its best lag has the largest log-likelihood ratio of both. It is known only if it is far above noise, and if every
-other peak, and no lag, explain the same rows worse in several separate windows and hardly better in any: a straight shows no lag, repeated
-lanes show several.
+The lag at which one signal explains most of the other's variance is the offset, refined by a parabola. Its standard deviation is that of
+the delete-a-group jackknife (Miller 1974, Biometrika 61), which needs no model of the residuals. The coarse search, over minutes, is by
+speed and turn rate together.
 """
 
 from __future__ import annotations
@@ -40,7 +36,6 @@ GRID_NS = round(GRID_S * 1e9)
 FIXES_S = 0.5
 """A velocity is made of fixes averaged over, and taken apart by, this long [s]: their noise is below the motion."""
 
-_LONGEST_NS, _STEP_NS = 1800 * 10**9, 300 * 10**9  # the window that is judged, and from one candidate to the next
 SMOOTH_S, _ACCELERATION_S, _SLOW_S = 0.1, 0.3, 4.0
 """Times over which speeds and yaw rates are averaged, and accelerations; slower changes are also slip and slopes [s]."""
 
@@ -71,14 +66,8 @@ def iterate_windows_ns(m: Measurements, length_ns: int) -> Iterator[Ints]:
 
 def find_liveliest_window_ns(m: Measurements) -> Ints | None:
     """Return the grid [ns] of the half hour in which the robot drives most; None without measurements."""
-    span = find_span_ns(m)
-    if span is None:
-        return None
-    first_ns, last_ns = span
-    begin = np.arange(first_ns, max(last_ns - _LONGEST_NS, first_ns) + 1, _STEP_NS, dtype=np.int64)
-    driven_m = np.diff(compute_driven_m(m, np.stack((begin, begin + _LONGEST_NS))), axis=0)
-    best = int(begin[np.argmax(driven_m)])
-    return make_grid_ns(best, min(last_ns, best + _LONGEST_NS))
+    windows = iterate_windows_ns(m, 1800 * 10**9)
+    return max(windows, key=lambda at_ns: float(np.diff(compute_driven_m(m, at_ns[[0, -1]]))[0]), default=None)
 
 
 def compute_driven_m(m: Measurements, at_ns: Ints) -> Floats:

@@ -128,8 +128,8 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
     # Over 2 s the noise of centimetres in fixes is below a turn; the mean is the bias of a gyroscope.
     smooth = {role: average(rate, 2.0) for role, rate in rates.items() if role not in found}
     turns = _compare_signals(smooth, centred=True)
-    times = [abs(ratio) for pair, ratio in turns.items() if IMU in pair]
-    wrong = (_check_units(turn, times, felt) or _check_mounting(level, yaws_rad)) if turn.size else None
+    turn_ratios = [abs(ratio) for pair, ratio in turns.items() if IMU in pair]
+    wrong = (_check_units(turn, turn_ratios, felt) or _check_mounting(level, yaws_rad)) if turn.size else None
     if wrong is not None:
         found[IMU], turn, yaws_rad = wrong, np.empty(0), {}
         turns = {pair: ratio for pair, ratio in turns.items() if IMU not in pair}
@@ -186,11 +186,11 @@ def _find_yaws(force: Plane, twists: Mapping[str, Floats]) -> dict[str, float]:
 def _check_units(turn: Floats, ratios: Sequence[float], felt: float) -> SensorExclusion | None:
     """Return the exclusion of an IMU in other units, by the yaw rates of others over its own, or its size, and the median force."""
     names, numbers = [], dict[str, float]()
-    most_radps = float(np.nan_to_num(np.percentile(np.abs(turn[np.isfinite(turn)]), 99.5)))
+    rate_radps = np.abs(turn[np.isfinite(turn)])
     if ratios and np.median(ratios) < 1.0 / 15.0:  # 1/57 in degrees
         names, numbers = ["deg"], {"turn_ratio": 1.0 / float(np.median(ratios))}
-    elif not ratios and most_radps > 15.0:  # no robot turns as fast
-        names, numbers = ["deg"], {"rate_max": most_radps}
+    elif not ratios and np.count_nonzero(rate_radps > 15.0) > 0.005 * turn.size:  # no robot turns as fast
+        names, numbers = ["deg"], {"rate_max": float(rate_radps.max())}
     low, high = GRAVITY_BAND_MPS2
     if low <= felt * GRAVITY_MPS2 <= high:
         names, numbers = [*names, "g"], numbers | {"force_median": felt}
@@ -207,11 +207,9 @@ def _check_mounting(level: Floats, yaws_rad: Mapping[str, float]) -> SensorExclu
         return None
     yaw_rad = next(iter(yaws_rad.values()), 0.0)
     turned_by = find_nearest_mounting(matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw_rad)) @ level)
-    names, numbers = (
-        {"evidence": "gravity" if by_gravity else "acceleration"},
-        {"off_rad": tilt_rad if by_gravity else yaw_rad},
-    )
-    return SensorExclusion(IMU, "imu-rotated", names, numbers, turned_by=turned_by)
+    names = {"evidence": "gravity" if by_gravity else "acceleration"}
+    off_rad = tilt_rad if by_gravity else yaw_rad
+    return SensorExclusion(IMU, "imu-rotated", names, {"off_rad": off_rad}, turned_by=turned_by)
 
 
 def find_nearest_mounting(base_from_sensor: Floats) -> Floats:

@@ -129,14 +129,6 @@ def test_a_track_without_a_place_is_a_finding():
     assert finding.code == "local-frame"
 
 
-def test_a_heading_that_the_course_does_not_show_is_a_finding_where_the_track_has_a_place():
-    later = stretch(heading_from="the IMU", clock_epoch=1, start_ns=2_000_000_000, end_ns=9_000_000_000)
-    (finding,) = warned(Section(0, datum_deg_m=PLACE), stretch(), later)
-    assert (finding.code, finding.names) == ("initial-yaw-uncertain", {"source": "the IMU"})
-    assert finding.span_s == (2.0, 9.0)
-    assert warned(Section(0), later) == ()
-
-
 def test_rows_that_were_set_aside_are_counted_but_not_those_of_a_sensor_that_was_refused():
     sleeps, blind = (make_finding("pose-increments", Subject("role", role)) for role in ("imu", "visual_odometry"))
     inputs = Section(

@@ -109,7 +109,7 @@ def test_an_hour_of_standing_is_not_what_is_judged():
     wheels = BodyVelocities(stamp_ns, np.column_stack((speed, nothing, nothing)), np.ones((speed.size, 3)), nothing)
     at_ns = find_liveliest_window_ns(Measurements(wheels=wheels))
     assert at_ns[0] >= 2.1 * 3600e9
-    assert (at_ns[-1] - at_ns[0]) * 1e-9 == pytest.approx(1800.0, abs=0.1)
+    assert (at_ns[-1] - at_ns[0]) * 1e-9 == pytest.approx(1800.0, abs=1.0)
 
 
 def wheels_at(at_s):
