@@ -1,7 +1,7 @@
 """tcpipe: from raw robot logs to datasets that a terrain-cost model can be trained on.
 
 The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dataset`, `open_dataset`,
-`train`, `evaluate`, `predict_path`, `plan_path`. They are loaded when they are first used, so that ``import tcpipe`` costs nothing;
+`train`, `evaluate`, `predict_path`, `plan_path`. They are loaded at first use, so that ``import tcpipe`` is fast;
 ``__init__.pyi`` gives editors and type checkers the module of each.
 """
 

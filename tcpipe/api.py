@@ -1,4 +1,4 @@
-"""The function `read_log`, and the commands `train`, `evaluate`, `predict-path` and `plan-path` as functions; their options are keywords.
+"""`read_log`, and the commands `train`, `evaluate`, `predict-path` and `plan-path` as functions with keywords.
 
 A function imports what it needs when it is called: a model of physics needs no plots, and a path no evaluation.
 """
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def read_log(path: Location, *, msgdef: Location | None = None) -> Log | TableLog:
     """Open a log: ``topics``, ``table(topic)``, ``tables(topics)``, ``damage``; a damaged log gives what is intact.
 
-    Raises `LogError`: the path is no log. ``msgdef`` is a directory of definitions of types that the log does not define.
+    Raises `LogError`: the path is no log. ``msgdef`` is a directory of type definitions that the log lacks.
     """
     from tcpipe.formats.logs.log_joining import open_single_log
 
@@ -36,8 +36,9 @@ def read_log(path: Location, *, msgdef: Location | None = None) -> Log | TableLo
 def run_train(options: TrainOptions) -> TrainResult:
     """Train a model on a dataset and write the model folder ``out``, whole or not at all.
 
-    ``str`` of the result is what the command prints. Raises `UsageError` where an option is out of its range, or ``out`` holds something
-    else; `DatasetError` or `ModelError` where the dataset cannot be trained on, or the state of an interrupted training is damaged.
+    ``str`` of the result is what the command prints. Raises `UsageError` if an option is out of its range, or ``out``
+    contains something else; `DatasetError` or `ModelError` if the dataset cannot be trained on, or the state of an
+    interrupted training is damaged.
     """
     from tcpipe.errors import UsageError
     from tcpipe.formats.recipe_toml import resolve_recipe
@@ -62,11 +63,11 @@ train = as_function(TrainOptions, run_train)
 
 
 def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
-    """Measure a model on a dataset's test samples and unseen area, or on whole drives, and write the evaluation to ``out``.
+    """Measure a model on a dataset's test samples and unseen area, or on whole drives; write the evaluation to ``out``.
 
-    ``values`` of the result are those of the written JSON; ``str`` of it is what the command prints. Raises `UsageError` where an option
-    is out of its range, ``out`` holds something else, or a drive is not in the store; `ModelError`, `DatasetError`, `MapError` or
-    `StoreError` where an input cannot be used.
+    ``values`` of the result are those of the written JSON; ``str`` of it is what the command prints. Raises
+    `UsageError` if an option is out of its range, ``out`` contains something else, or a drive is not in the store;
+    `ModelError`, `DatasetError`, `MapError` or `StoreError` if an input cannot be used.
     """
     model, dataset, out, store = options.model, options.dataset, options.out, options.store
     if options.drive:
@@ -99,8 +100,9 @@ evaluate = as_function(EvaluateOptions, run_evaluate)
 def run_predict_path(options: PredictPathOptions) -> PathResult:
     """Predict the time and energy of a path, with intervals.
 
-    The result has length [m], time [s], energy [J], their intervals, and the pieces without a cost; ``str`` of it is what the command
-    prints. Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` where an input cannot be used.
+    The result has length [m], time [s], energy [J], their intervals, and the path segments without a cost; ``str`` of
+    it is what the command prints. Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` if an
+    input cannot be used.
     """
     from tcpipe.learning.models import choose_model
     from tcpipe.planning.path_files import choose_map
@@ -121,10 +123,11 @@ predict_path = as_function(PredictPathOptions, run_predict_path)
 
 
 def run_plan_path(options: PlanPathOptions) -> PlanResult:
-    """Find the path of least energy, time or distance between two points and write it as GeoJSON and as messages for Nav2.
+    """Write the path of least energy, time or distance between two points as GeoJSON and as messages for Nav2.
 
     The result has the totals, and ``lonlat_deg``, the points of the path; ``str`` of it is what the command prints.
-    Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` where an input cannot be used, or there is no path.
+    Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` if an input cannot be used, or there is
+    no path.
     """
     from tcpipe.learning.models import choose_model
     from tcpipe.planning.path_files import choose_map, plan

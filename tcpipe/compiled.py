@@ -1,8 +1,8 @@
 """Compilation of numeric kernels by numba, with a cache on disk.
 
-The first compilation takes seconds, so a listener reports it through the logger ``tcpipe``: the program does not hang. If an
-installation is read-only and has no home directory, the cache is a temporary directory. Numba compares only the kernel's own file with
-its cache; tcpipe also compares what this file imports.
+The first compilation takes seconds, so a listener reports it through the logger ``tcpipe``: the program does not hang.
+If an installation is read-only and has no home directory, the cache is a temporary directory. Numba compares only the
+kernel's own file with its cache; tcpipe also compares what this file imports.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ _load = CPUContext.load_additional_registries
 def _load_without_blas(context: CPUContext) -> None:
     """Load what numba needs, in the command line without scipy's linear algebra, whose import takes 0.2 s.
 
-    Numba would reject a kernel that multiplies matrices. Programs that import tcpipe may have such kernels, so they load it.
+    Numba would reject a kernel that multiplies matrices. Programs that import tcpipe may have such kernels, so they
+    load it.
     """
     if "tcpipe.cli" not in sys.modules or _BLAS in sys.modules:
         _load(context)
@@ -79,13 +80,13 @@ def compile_kernel(function: Callable[..., Any]) -> Any:
         compiled = numba.njit(**options)(function)
     if isinstance(compiled, Dispatcher):  # it is none where NUMBA_DISABLE_JIT is set
         index = _index_of(compiled)
-        index._source_stamp = _stamp(index._source_stamp, function)  # noqa: SLF001  numba has no public way to say what else there is
+        index._source_stamp = _stamp(index._source_stamp, function)  # noqa: SLF001  numba has no public way for this
         index._load_index = partial(_load_overloads, index._load_index)  # noqa: SLF001
     return compiled
 
 
 def _load_overloads(load: Callable[[], dict[_Key, str]]) -> dict[_Key, str]:
-    """Return the cached overloads of a kernel; none if the cache of an earlier version names a class that no longer exists."""
+    """Return the cached overloads of a kernel; none if an old cache names a class that no longer exists."""
     try:
         return load()
     except (AttributeError, ImportError):
@@ -95,8 +96,8 @@ def _load_overloads(load: Callable[[], dict[_Key, str]]) -> dict[_Key, str]:
 def _stamp(source: bytes, function: Callable[..., Any]) -> str:
     """Return the checksum of a kernel's inputs: its file, and the imported values that numba compiles into it.
 
-    These values are numbers and text, other kernels (by their own stamps) and the fields of named tuples. Values that the module
-    defines are in its file.
+    These values are numbers and text, other kernels (by their own stamps) and the fields of named tuples. Values that
+    the module defines are in its file.
     """
     made_of = [repr(source)]
     for name, value in sorted(function.__globals__.items()):
@@ -115,7 +116,7 @@ def _index_of(compiled: Any) -> Any:
 
 
 def _is_plain(value: object) -> bool:
-    """Return whether numba compiles a value in as a constant, and ``repr`` shows all of it: a number, a text or a tuple of these."""
+    """Return whether numba compiles a value as a constant that ``repr`` shows: a number, a text or a tuple of these."""
     return all(map(_is_plain, value)) if isinstance(value, tuple) else isinstance(value, Number | str)
 
 

@@ -26,9 +26,9 @@ def hide_secrets(text: str) -> str:
 
 
 def split_secrets(scheme: str, rest: str) -> tuple[str, str]:
-    """Return what may be shown of a URL after its scheme (``http://``), and its query or fragment; no user info is in either.
+    """Return the printable part of a URL after its scheme (``http://``), and its query or fragment, without user info.
 
-    An unescaped password may hold any character, ``/`` too.
+    An unescaped password may contain any character, even ``/``.
     """
     host = re.split(r"[/?#]", rest, maxsplit=1)[0]
     is_http = scheme.lower().startswith("http")

@@ -1,6 +1,7 @@
-"""Independent tasks side by side, in this process, local processes or on a cluster; a worker that dies costs only its own task.
+"""Independent tasks in this process, local processes or on a cluster; a worker that dies loses only its own task.
 
-This process logs what its workers log. Local workers end with it, and at once when it is interrupted; a cluster's finish their tasks.
+This process logs the messages of its workers. Local workers end with it, and at once on interruption; a cluster's
+finish their tasks.
 The home of dask.
 """
 
@@ -64,13 +65,14 @@ def unwrap_result(outcome: Outcome[R | TcpipeError]) -> R:
 def run_all(
     function: Callable[[T], R], tasks: Iterable[T], *, jobs: int, cluster: str | None = None
 ) -> Generator[Outcome[R]]:
-    """Yield the outcome of ``function(task)`` for every task, as each ends; a task is asked for when a worker can have it.
+    """Yield each outcome of ``function(task)`` as it ends; a task is requested when a worker is free for it.
 
-    ``function`` and tasks are picklable (workers are spawned); ``function`` returns its errors rather than raising them.
+    ``function`` and tasks are picklable (workers are spawned); ``function`` returns errors instead of raising them.
     Use it within ``contextlib.closing``: workers end when the iterator is closed.
 
-    With ``cluster``, the address of a Dask scheduler, its workers do it instead of ``jobs`` processes. They see the same files under the
-    same names. `UsageError`: there is no such scheduler, it has no workers, or one of them has several threads or another tcpipe.
+    With ``cluster``, the address of a Dask scheduler, its workers replace ``jobs`` processes. They see the same files
+    under the same names. `UsageError`: there is no such scheduler, it has no workers, or one of them has several
+    threads or another tcpipe.
     """
     refuse_import_of_script(jobs)
     todo = enumerate(tasks)
@@ -88,15 +90,16 @@ _WORKER = "tcpipe worker"
 _UNGUARDED_EXIT = 78
 """Exit code of a worker that ran the calls of its script again, EX_CONFIG of sysexits.h."""
 _UNGUARDED = (
-    "a script that uses several workers needs a main guard, because each worker imports the script: put its calls below "
+    "a script that uses several workers needs a main guard, because each worker imports the script: "
+    "put its calls below "
     "'if __name__ == \"__main__\":', or use jobs=1"
 )
 
 
 def refuse_import_of_script(jobs: int) -> None:
-    """Raise an error in a process that imports the script of its parent and so repeats the parent's call with several ``jobs``.
+    """Raise an error in a process that imports its parent's script and so repeats the parent's call with ``jobs``.
 
-    A worker of tcpipe ends without a word: its parent raises the `UsageError`.
+    A worker of tcpipe ends silently: its parent raises the `UsageError`.
     """
     process = multiprocessing.current_process()
     if jobs > 1 and getattr(process, "_inheriting", False):  # as multiprocessing itself finds out
@@ -115,7 +118,7 @@ class _WorkerContext(SpawnContext):
 
 
 def _run_in_pools(function: Callable[[T], R], todo: Iterator[tuple[int, T]], jobs: int) -> Iterator[Outcome[R]]:
-    """Run tasks in local processes; those that ran when the pool broke run again, one by one, before another pool goes on."""
+    """Run tasks in local processes; those of a broken pool run again, one by one, before another pool continues."""
     while first := next(todo, None):
         todo, running, suspects = chain([first], todo), dict[Future[R], tuple[int, T]](), list[tuple[int, T]]()
         with _pool(jobs) as pool:
@@ -182,7 +185,7 @@ def _repeat(heard: Connection) -> None:
 
 
 def _begin_worker(life: Connection, saying: Connection, level: int) -> None:
-    """Prepare a worker: an interrupt is its parent's business, what it logs goes to its parent, and so does its life."""
+    """Prepare a worker: it ignores interrupts, ends with its parent, and sends its log messages to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logger.addHandler(_LogForwarder(saying.send))
     logger.setLevel(level)
@@ -197,7 +200,7 @@ def _end_with(life: Connection) -> None:
 
 
 class _LogForwarder(logging.Handler):
-    """Hands what a worker logs to ``send``, as arguments of `Logger.log`: plain values, what is said as text of one argument."""
+    """Handler that passes a worker's records to ``send`` as plain values for `Logger.log`, the message as text."""
 
     def __init__(self, send: Callable[[Said], None]) -> None:
         super().__init__()
@@ -214,7 +217,7 @@ _spent = {"cpu_s": 0.0}
 
 
 def read_cluster_cpu_s() -> float:
-    """Return the CPU seconds that clusters' workers spent on tasks of this process, as `resource.RUSAGE_CHILDREN` counts local ones."""
+    """Return CPU seconds of cluster workers on tasks of this process, as `resource.RUSAGE_CHILDREN` for local ones."""
     return _spent["cpu_s"]
 
 
@@ -277,7 +280,7 @@ def _run_elsewhere(function: Callable[[T], R], todo: Iterator[tuple[int, T]], cl
 
 
 def _get_outcome(future: Future[_Answer[R]], index: int, name: str) -> Outcome[R]:
-    """Return what became of a task, after saying what it logged; `UsageError` where workers are not as they have to be."""
+    """Return the outcome of a task after logging its messages; `UsageError` for workers that do not qualify."""
     try:
         answer = future.result()
     except (TcpipeError, CancelledError):
@@ -336,7 +339,7 @@ def _mute_loggers(*names: str) -> Iterator[None]:
 
 
 def _count_workers(client: Client, address: str) -> int:
-    """Return the number of workers; `UsageError` without any, or if one has several threads, no tcpipe or another version of it."""
+    """Return the number of workers; `UsageError` without any, or with several threads, no tcpipe or another version."""
     start = f"dask worker {address} --nthreads 1"
     try:
         client.wait_for_workers(1, timeout=_ANSWER_S)

@@ -1,9 +1,9 @@
-"""Cutting a steady stretch of path into segments by chord (paper, section IV: straight-line distance d, path nearly as long).
+"""Cut of a steady path into segments by chord (paper, section IV: straight-line distance d, path nearly as long).
 
-A segment ends where the path first is d away from the segment's start, and the next one starts at exactly that state. Where the path
-in between is too curved, the start moves on to the next sample of the track, until a segment from there is straight enough; the
-metres passed over are *curved*. Moving on by one sample rather than to the end of the rejected piece recovers the straight metres
-behind a bend. What remains at the end of a stretch, shorter than a chord, is *leftover*.
+A segment ends where the path is first d away from the segment's start, and the next one starts at exactly that state.
+If the path between is too curved, the start moves to the next sample of the track, until a segment from there is
+straight enough; the skipped metres are *curved*. Moving by one sample rather than to the end of the rejected piece
+recovers the straight metres behind a bend. The remainder at the end, shorter than a chord, is *leftover*.
 
 Also: cutting a planned line by chord.
 """
@@ -30,7 +30,8 @@ class Cut:
     Attributes
     ----------
     start_ns, end_ns : [ns], shape (M,), int64; in order, never overlapping.
-    curved_ns, leftover_ns : [ns], shape (C, 2) and (L, 2), int64: begin and end of every other piece; the three kinds tile the stretch.
+    curved_ns, leftover_ns : [ns], shape (C, 2) and (L, 2), int64: begin and end of every other piece; all three
+        together tile the path.
     """
 
     start_ns: Ints

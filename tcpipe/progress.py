@@ -46,7 +46,9 @@ def step(stage: str, done: int = 0, total: int = 0) -> None:
 
 def step_of(record: logging.LogRecord) -> Step | None:
     """Return the progress in a record, None in any other."""
-    return Step(*record.args) if record.levelno == STEP and isinstance(record.args, tuple) else None  # type: ignore[arg-type]
+    if record.levelno == STEP and isinstance(record.args, tuple):
+        return Step(*record.args)  # type: ignore[arg-type]
+    return None
 
 
 @dataclass(slots=True)

@@ -1,6 +1,6 @@
 """Scatter by medians, which outliers do not move, and non-negative least squares.
 
-scipy.optimize has the latter too, and is what the tests compare with; each process that fuses would take a third of a second to load it.
+scipy.optimize has the latter, too, and tests compare with it; importing it would take 0.3 s in each process that fuses.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ MEDIAN_OF_SQUARES = NORMAL_MEDIAN**2
 
 
 def estimate_robust_std(residuals: NDArray[np.float64]) -> float:
-    """Return the standard deviation of residuals about zero: that of the normal variate whose median absolute value is theirs."""
+    """Return σ of residuals about zero: that of the normal distribution with the same median absolute value."""
     return float(np.median(np.abs(residuals))) / NORMAL_MEDIAN
 
 
 def estimate_shorth(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return centre and σ of the finite values by the shortest half of them, for few as Rousseeuw and Leroy (1987); of none 0, 0."""
+    """Return centre and σ of finite values by their shortest half, for few: Rousseeuw and Leroy (1987); none: 0, 0."""
     rising = np.sort(values[np.isfinite(values)])
     if not rising.size:
         return 0.0, 0.0
@@ -34,8 +34,8 @@ def estimate_shorth(values: NDArray[np.float64]) -> tuple[float, float]:
 def solve_non_negative(columns: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the factors, none negative, shape (J,), by which the columns (S, J) add up nearest to the target (S,).
 
-    Lawson and Hanson, Solving Least Squares Problems (1974), algorithm 23.10 (NNLS): the column that reduces the residual most becomes
-    free, one after the other; a factor that would become negative is held at zero.
+    Lawson and Hanson, Solving Least Squares Problems (1974), algorithm 23.10 (NNLS): the column that reduces the
+    residual most becomes free, one after the other; a factor that would become negative is fixed at zero.
     """
     factors, free, vain = np.zeros(columns.shape[1]), *np.zeros((2, columns.shape[1]), np.bool_)
     rounding = 10.0 * np.finfo(np.float64).eps * np.linalg.norm(columns, axis=0) * np.linalg.norm(target)

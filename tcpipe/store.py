@@ -60,7 +60,7 @@ class Store:
         self.put(state, "runs", make_run_key(run.log.sha256, run.recipe_id), strip_repeated(run))
 
     def put_blob(self, directory: Path) -> str:
-        """Put the files of a directory in the workshop of this place into a new folder of payload, and return its name."""
+        """Put a directory's files in this store's workshop into a new payload folder, and return its name."""
         name = make_unique_name()
         self.place.put_files(f"{BLOBS}/{name}", directory)
         return name
@@ -71,9 +71,9 @@ class Store:
         return self._list_runs(state, {key: row for key, row in state.runs.items() if counts(row, state)})
 
     def find_runs(self, name: str, state: State | None = None) -> list[StoredRun]:
-        """Return a run under each recipe, or, of ``RUN/RECIPE``, under one; none where there is no such run with its tables.
+        """Return a run under each recipe, or, for ``RUN/RECIPE``, under one; none without such a run with its tables.
 
-        `StoreError`: there is such a run, but its tables are gone.
+        Raises `StoreError`: there is such a run, but its tables are gone.
         """
         state = self.scan() if state is None else state
         run_id, _, recipe_id = name.partition("/")
@@ -93,7 +93,7 @@ class Store:
         return sorted(found, key=lambda run: (run.run_id, run.recipe_id))
 
     def map_at(self, record: StoredMap) -> tuple[Path, FetchedShards | None]:
-        """Return the place of a map on this machine, and of its tiles if the store is in a bucket, as `open_map` takes them."""
+        """Return the local path of a map, and its tiles if the store is in a bucket, as for `open_map`."""
         place, described = self.place.below(f"{BLOBS}/{record.blob}"), ("/zarr.json", f"/{CHECKSUMS}")
         root, fetched = fetch_files(place, record.files, by_range=lambda name: not name.endswith(described))
         return root / f"{record.name}.zarr", fetched
@@ -107,7 +107,7 @@ class Store:
 
     @contextmanager
     def new_map(self, name: str) -> Iterator[tuple[Path, Callable[[State], None]]]:
-        """Yield where a map is to be written, and beside it a picture ``.png``, and a function that puts both into the store."""
+        """Yield the path for a new map (its picture ``.png`` beside it), and a function that stores both."""
         with self.place.workshop() as directory, convert_run_errors(self.place.where(BLOBS), directory):
 
             def put(state: State) -> None:
@@ -142,7 +142,7 @@ def counts(row: RunFacts, state: State) -> bool:
 
 
 def name_run(state: State, stem: str, sha256: str) -> str:
-    """Return the name of the run of a content: its own, or a new one that differs from those of other logs of the same name."""
+    """Return the name of the run of a content: its own, or a new one unlike those of other logs of the same name."""
     if known := state.find_run_id(sha256):
         return known
     taken = {row.run_id for row in state.runs.values()}
@@ -205,7 +205,8 @@ def find_named_runs(name: Location, store: Location) -> list[StoredRun]:
     """Return the runs called RUN, under each recipe, or RUN/RECIPE; `UsageError` if the store has none."""
     if str(name) != str(store) and not is_store(store):
         raise UsageError(
-            f"{name}: there is no such file or directory; if it is a run, name its store with --store: there is none at {store}"
+            f"{name}: there is no such file or directory; if it is a run, name its store with --store: "
+            f"there is none at {store}"
         )
     found = open_store(store).find_runs(str(name))
     if not found:

@@ -70,7 +70,8 @@ _GROUPS = {
         "reproduce": ("model_commands", "Repeat the paper's experiment on a simulated site"),
     },
 }
-"""The module and purpose of each command, in groups, in the order a user meets them; the command NAME-X is the function NAME_X there."""
+"""Module and purpose of each command, in groups, in the order a user meets them; the command NAME-X is the function
+NAME_X there."""
 _NEXT_STEPS = {
     "demo": "tcpipe train {directory}/dataset",
     "preflight": "tcpipe ingest {log}",
@@ -103,7 +104,7 @@ _COMMANDS = {name: entry for group in _GROUPS.values() for name, entry in group.
 
 
 class _Commands(Mapping[str, click.Command]):
-    """Commands by name; each is imported when it is asked for, so that ``--help`` and every other command start fast."""
+    """Commands by name; each is imported on demand, so that ``--help`` and every other command start fast."""
 
     def __getitem__(self, name: str) -> click.Command:
         return _load(name, *_COMMANDS[name])
@@ -150,13 +151,21 @@ class _Group(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  click's signature
         return list(self.commands)
 
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002  click's signature
+    def format_commands(  # click's signature
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        formatter: click.HelpFormatter,
+    ) -> None:
         for title, group in _GROUPS.items():
             with formatter.section(title):
                 formatter.write_dl([(name.ljust(_WIDTH), about) for name, (_, about) in group.items()])
 
 
-def _begin_debugging(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001  click's signature
+def _begin_debugging(
+    context: click.Context,
+    _: click.Parameter,
+    wanted: bool,  # noqa: FBT001  click's signature
+) -> None:
     root = context.find_root()
     if wanted and not root.meta.get("debugging"):
         root.meta["debugging"] = True
@@ -212,9 +221,9 @@ class Terminated(BaseException):
 def prepare_process() -> None:
     """Open standard files that are closed, print what is no text as escapes, and end in order on SIGTERM and SIGHUP.
 
-    Linear algebra gets one thread, unless the environment says otherwise: matrices here are small, more threads only wait for each other,
-    and bytes would depend on their number. Objects that refer to each other are looked for a seventieth as often as Python does by itself:
-    while numba compiles, that was a tenth of the time.
+    Linear algebra gets one thread, unless the environment states otherwise: matrices here are small, more threads only
+    wait for each other, and bytes would depend on their number. The cyclic garbage collector runs 70 times less often
+    than by default: while numba compiles, it took a tenth of the time.
     """
     gc.set_threshold(50_000)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

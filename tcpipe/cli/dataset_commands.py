@@ -42,10 +42,10 @@ if TYPE_CHECKING:
 @json_option
 @quiet_option
 def add_map(options: AddMapOptions, *, strays: tuple[str, ...], as_json: bool, quiet: bool) -> None:
-    """Put rasters on one common grid and add them to the store as map NAME; their grids, resolutions and CRS may differ.
+    """Put rasters on one common grid and add them to the store as map NAME; grids, resolutions and CRS may differ.
 
-    A raster is a GeoTIFF, JPEG 2000 or ERDAS Imagine file. For a raster of many tiles, give a pattern in quotes, --height 'dem/*.tif', or
-    repeat the option; where tiles overlap, tcpipe uses the last one.
+    A raster is a GeoTIFF, JPEG 2000 or ERDAS Imagine file. For a raster of many tiles, give a pattern in quotes,
+    --height 'dem/*.tif', or repeat the option; where tiles overlap, tcpipe uses the last one.
     """
     from tcpipe.pipeline.maps import run_add_map
 
@@ -63,8 +63,8 @@ def add_map(options: AddMapOptions, *, strays: tuple[str, ...], as_json: bool, q
 def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -> int:
     """Sample a rotated patch for every segment, split by region, and write the dataset to OUT (default: dataset).
 
-    An existing dataset with the same options is built again from the current runs. If its options differ, the command fails,
-    unless --force is given.
+    An existing dataset with the same options is built again from the current runs. If its options differ, the command
+    fails, unless --force is given.
 
     Exit code 3: runs are excluded or missing, or a requested split is empty; a line for each names the remedy.
     """
@@ -90,10 +90,10 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
 )
 @recipe_option
 def report(path: str, *, store: str, no_runs: bool, recipe: str | None) -> None:
-    """Write report.html for PATH, a dataset or a store, or for RUN or RUN/RECIPE of the store; and print the robots' physics.
+    """Write report.html for PATH (dataset or store), or RUN or RUN/RECIPE of the store; print the robots' physics.
 
-    Without an argument: for the store and all of its runs. The page of the store sums over the runs of the current recipe. A page needs no
-    network; tcpipe does not write a page again whose inputs have not changed.
+    Without an argument: for the store and all of its runs. The page of the store sums over the runs of the current
+    recipe. A page needs no network; tcpipe does not write a page again whose inputs have not changed.
     """
     from tcpipe.pipeline.report import report as run
 
@@ -119,8 +119,8 @@ def export(
 ) -> int:
     """Write topics of LOG to OUT as Parquet, one file per topic, one row per message, columns by dotted field name.
 
-    The metadata of the files has the definition of the message. tcpipe does not write topics again that OUT already contains from the
-    same log.
+    The metadata of the files has the definition of the message. tcpipe does not write topics again that OUT already
+    contains from the same log.
     """
     import resource
 
@@ -171,7 +171,7 @@ def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: b
 @add_path_or_run("path", "[PATH|RUN]", required=False)
 @json_option
 def verify(path: str, *, store: str, as_json: bool) -> int:
-    """Read the dataset, map, model or cost map at PATH, or RUN of the store, or the whole store, again: compare checksums and counts.
+    """Compare checksums and counts of the dataset, map, model or cost map at PATH, of RUN, or of the whole store.
 
     Exit code 1: a file has changed, is missing or contradicts another.
     """
@@ -187,7 +187,7 @@ def verify(path: str, *, store: str, as_json: bool) -> int:
 @click.argument("b", type=SEALED, metavar="B")
 @json_option
 def diff(a: str, b: str, *, as_json: bool) -> int:
-    """List what changed from A to B and why (log, recipe key, map, region, code), and how the labels shift; exit code 1 if they differ."""
+    """List changes from A to B, causes (log, recipe key, map, region, code) and label shifts; exit code 1 if any."""
     from tcpipe.pipeline.diff import diff as run
 
     found = run(a, b)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def inspect(
     path: str, *, full: bool, robot: str | None, recipe: str | None, msgdef: str | None, store: str, as_json: bool
 ) -> int:
-    """List the content of PATH: a log's topics, types, rates and roles, with reasons; a map; a dataset; without it, the store.
+    """List a log's topics, types, rates and roles, with reasons; a map; a dataset; without PATH, the store.
 
     RUN, or RUN/RECIPE, is a run of the store.
     """
@@ -179,7 +179,8 @@ def _print_dataset(found: InspectedDataset) -> None:
     labels = [name for name in found.labels if name not in found.absent_labels]
     print_line(f"layers: {', '.join(found.layers) or 'none'}; labels: {', '.join(labels)}")
     print_line(
-        f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps) or 'not stated'}"
+        f"runs: {', '.join(run.run_id for run in found.runs)}; map: "
+        f"{', '.join(entry.name for entry in found.maps) or 'not stated'}"
     )
     for line in list_verdict(found.verdict):
         print_line(f"verdict: {line}")

@@ -52,14 +52,14 @@ if TYPE_CHECKING:
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object when each log ends, and one summary.")
 @quiet_option
 def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool) -> int:
-    """Read logs, fuse the sensors, mask unsteady driving, cut 1 m segments, and label them with power, velocity, time and energy.
+    """Read logs, fuse sensors, mask unsteady driving, cut 1 m segments, label their power, velocity, time and energy.
 
-    A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, a folder of these, or an s3:// URL. tcpipe skips logs that are in the
-    store (same content, same recipe) and logs that failed before with the same content. It prints a line when each log ends (--quiet:
-    not for a log that is unchanged); for several logs, findings follow by code.
+    A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, a folder of these, or an s3:// URL. tcpipe skips logs that
+    are in the store (same content, same recipe) and logs that failed before with the same content. It prints a line
+    when each log ends (--quiet: not for a log that is unchanged); for several logs, findings follow by code.
 
-    Exit code 3: some logs failed, are damaged, or give no segments although the robot drove, and the problem is new: not reported
-    before and not acknowledged (tcpipe acknowledge).
+    Exit code 3: some logs failed, are damaged, or give no segments although the robot drove, and the problem is new:
+    not reported before and not acknowledged (tcpipe acknowledge).
     """
     from tcpipe.formats.json_files import convert_record
     from tcpipe.pipeline.ingest import SummaryLine, run_ingest
@@ -227,7 +227,7 @@ def _print_known(summary: IngestSummary) -> None:
 def status(
     paths: tuple[str, ...], *, store: str, recipe: str | None, robot: str | None, min_age_s: float, as_json: bool
 ) -> int:
-    """List for every log whether it is in the store, waits for ingest, failed or is growing, and why; and the latest calls.
+    """List whether each log is in the store, waits for ingest, failed or is growing, and why; and the latest calls.
 
     Without LOG: the logs and folders that the latest calls of ingest were given. The command does not read logs.
 
@@ -264,10 +264,10 @@ def status(
 def preflight(
     log: str, *, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool
 ) -> int:
-    """Predict from LOG, a typical minute or more, how much data a day of such recording gives, and what to correct before.
+    """Predict the data of a day from LOG, a typical minute or more, and list what to correct before recording.
 
-    Prints segments per hour, the distance breakdown, the uncertainty of labels, the verdict, and findings with remedies. Writes no
-    files.
+    Prints segments per hour, the distance breakdown, the uncertainty of labels, the verdict, and findings with
+    remedies. Writes no files.
 
     Exit codes: 0 ready; 3 warnings, errors or no segments; 1 ingest would fail.
     """
@@ -296,8 +296,8 @@ def audit(
 ) -> int:
     """Judge the uncertainty of LOG, or of RUN or RUN/RECIPE of the store, by measurements that its track does not use.
 
-    tcpipe fuses the run without its fixes in windows of 10, 30 and 60 s and prints the error of the predicted antenna, its σ, and the
-    share of errors inside 1σ and 2σ. Without fixes: length of the track over that of each odometry.
+    tcpipe fuses the run without its fixes in windows of 10, 30 and 60 s and prints the error of the predicted antenna,
+    its σ, and the share of errors inside 1σ and 2σ. Without fixes: length of the track over that of each odometry.
     """
     from tcpipe.pipeline.audit import audit as judge
 
@@ -318,7 +318,7 @@ def audit(
 @store_option
 @json_option
 def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
-    """Acknowledge problems that somebody has checked: damaged or failed logs, runs without segments. tcpipe then stops reporting them.
+    """Acknowledge checked problems (damaged or failed logs, runs without segments): tcpipe stops reporting them.
 
     Name a killed call as status prints it; name a waiting log, a damaged document or a dataset by its path.
 
@@ -351,10 +351,10 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
 def prune(
     *, runs: tuple[str, ...], store: str, recipe: str | None, forget: tuple[str, ...], dry_run: bool, as_json: bool
 ) -> int:
-    """Remove superseded runs, and those of earlier recipes that the current recipe replaces; or each RUN (or RUN/RECIPE).
+    """Remove superseded runs, and those of earlier recipes that the current one replaces; or each RUN or RUN/RECIPE.
 
-    tcpipe also removes files of killed calls. It keeps runs that a dataset needs and folders that contain files of others. While
-    another call works on the store it removes nothing.
+    tcpipe also removes files of killed calls. It keeps runs that a dataset needs and folders that contain files of
+    others. While another call works on the store it removes nothing.
     """
     from tcpipe.pipeline.prune import prune as run
 
@@ -369,9 +369,10 @@ def prune(
 @store_option
 @json_option
 def overlay(run: str, out: str, *, store: str, as_json: bool) -> None:
-    """Write OUT.mcap from RUN or RUN/RECIPE of the store, on the clock of its log: open both in Foxglove, or OUT in Rerun or PlotJuggler.
+    """Write OUT.mcap from RUN or RUN/RECIPE of the store, on the clock of its log.
 
-    OUT contains the fused track, segments with labels, masked sections with reasons, and rejected measurements.
+    OUT contains the fused track, segments with labels, masked sections with reasons, and rejected measurements. Open
+    both in Foxglove, or OUT in Rerun or PlotJuggler.
     """
     from tcpipe.pipeline.overlay import write_overlay as write
 

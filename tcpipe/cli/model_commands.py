@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:
     """Train a model on DATASET and write it to the folder OUT.
 
-    Without options: the simplest of curves, physics and boosted trees that predicts other runs as well as the best. --model resnet18,
-    or an option of it, trains the paper's network. Boosted trees need pip install 'tcpipe[tables]', a network 'tcpipe[train]'; it uses
-    a GPU if there is one, and an interrupted training resumes.
+    Without options: the simplest of curves, physics and boosted trees that predicts other runs as well as the best.
+    --model resnet18, or an option of it, trains the paper's network. Boosted trees need pip install 'tcpipe[tables]', a
+    network 'tcpipe[train]'; it uses a GPU if there is one, and an interrupted training resumes.
     """
     from tcpipe.api import run_train
 
@@ -47,12 +47,13 @@ def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:
 def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
     """Evaluate MODEL on DATASET's test samples and unseen area, and write evaluation.json and .html to OUT.
 
-    RMSE and MAPE of power, velocity, time and energy by terrain class; baselines, centred by the same rule; the coverage of intervals;
-    the ablation of the input layers; the expected time; the noise floor of the labels; all with the values of the paper.
-    predictions.parquet has every prediction. OUT may be a URL in a bucket, where each evaluation is a folder of its own.
+    RMSE and MAPE of power, velocity, time and energy by terrain class; baselines, centred by the same rule; the
+    coverage of intervals; the ablation of the input layers; the expected time; the noise floor of the labels; all with
+    the values of the paper. predictions.parquet has every prediction. OUT may be a URL in a bucket, where each
+    evaluation is a folder of its own.
 
-    With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals, in drives.json of OUT;
-    DATASET, which MODEL was trained on, shows whether a drive was held back.
+    With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals, in
+    drives.json of OUT; DATASET, which MODEL was trained on, shows whether a drive was held back.
     """
     from tcpipe.api import run_evaluate
 
@@ -87,8 +88,9 @@ def benchmark(
 ) -> None:
     """Train and evaluate every kind of model on every DATASET, and print the paper's table of each.
 
-    RMSE and MAPE of power, velocity, energy and time by class, with 95 % intervals over runs and trainings; coverage, CRPS, training
-    time, and the largest R² that the noise of the labels allows. Writes benchmark.json and .html; an interrupted call resumes.
+    RMSE and MAPE of power, velocity, energy and time by class, with 95 % intervals over runs and trainings; coverage,
+    CRPS, training time, and the largest R² that the noise of the labels allows. Writes benchmark.json and .html; an
+    interrupted call resumes.
     """
     from tcpipe.experiment.benchmark import KINDS, run_benchmark
 
@@ -124,9 +126,9 @@ def reproduce(
 ) -> None:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and test the claims of the paper.
 
-    Runs 'tcpipe benchmark' on it. Takes some two hours a training on two cores, minutes with --size small; an interrupted call
-    resumes. The data are simulated: compare the pattern with the paper, not the numbers. Writes reproduction.html,
-    reproduction.json and all intermediate results to DIR.
+    Runs 'tcpipe benchmark' on it. Takes some two hours a training on two cores, minutes with --size small; an
+    interrupted call resumes. The data are simulated: compare the pattern with the paper, not the numbers. Writes
+    reproduction.html, reproduction.json and all intermediate results to DIR.
     """
     from tcpipe.experiment.reproduction import reproduce as run
 
@@ -140,10 +142,10 @@ def reproduce(
 @json_option
 @quiet_option
 def predict_path(options: PredictPathOptions, *, as_json: bool, quiet: bool) -> int:
-    """Cut a path into segments of one metre and predict the time and energy of each and of the whole path, with intervals.
+    """Predict time and energy of a path and of each of its segments of one metre, with intervals.
 
-    The command marks and counts path segments that MODEL cannot predict (class, slope or relief outside the training range, outside
-    the map, no data, not traversable). Exit code 3: some path segments have no cost.
+    The command marks and counts path segments that MODEL cannot predict (class, slope or relief outside the training
+    range, outside the map, no data, not traversable). Exit code 3: some path segments have no cost.
     """
     from tcpipe.api import run_predict_path
 
@@ -160,8 +162,9 @@ def predict_path(options: PredictPathOptions, *, as_json: bool, quiet: bool) -> 
 def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
     """Predict power, velocity, and time and energy per metre, along 16 courses in every cell of a map.
 
-    Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with one band per course, the reasons where MODEL cannot predict, and
-    maps for Nav2. An interrupted call resumes; OUT may be a URL in a bucket, where each map is a folder of its own.
+    Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with one band per course, the reasons where MODEL cannot
+    predict, and maps for Nav2. An interrupted call resumes; OUT may be a URL in a bucket, where each map is a folder of
+    its own.
     """
     from tcpipe.planning.cost_map import make_cost_map
 
@@ -192,8 +195,9 @@ def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[Model, Ma
 def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
     """Find the path of least energy, time or distance between two points; costs depend on the direction of travel.
 
-    Writes GeoJSON to --out, and beside it a nav_msgs/Path (.path.json) and the goal of Nav2's FollowGPSWaypoints (.waypoints.json).
-    Exit code 3: parts of the path have no cost, because --cell-size is large, or the budget is too small.
+    Writes GeoJSON to --out, and beside it a nav_msgs/Path (.path.json) and the goal of Nav2's FollowGPSWaypoints
+    (.waypoints.json). Exit code 3: parts of the path have no cost, because --cell-size is large, or the budget is too
+    small.
     """
     from tcpipe.api import run_plan_path
 
@@ -208,7 +212,7 @@ def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
 @json_option
 @quiet_option
 def route_graph(options: RouteGraphOptions, *, as_json: bool, quiet: bool) -> int:
-    """Write time, energy and their standard deviations into a graph of Nav2's route server, for each edge in its own direction.
+    """Write time, energy and their standard deviations into a graph of Nav2's route server, for each directed edge.
 
     Exit code 3: some edges have no cost; they are left out.
     """

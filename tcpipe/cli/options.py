@@ -36,13 +36,23 @@ class Place(click.ParamType[str]):
         self.urls = urls
         """Whether it may be a URL."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ARG002  click's signature
+    def convert(
+        self,
+        value: Any,
+        param: click.Parameter | None,  # noqa: ARG002  click's signature
+        ctx: click.Context | None,  # noqa: ARG002  click's signature
+    ) -> Any:
         """Return the text as it was given."""
         if not (self.urls and "://" in value):
             self._check(value)
         return value
 
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002  click's signature
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002  click's signature
+        param: click.Parameter,  # noqa: ARG002  click's signature
+        incomplete: str,
+    ) -> list[CompletionItem]:
         """Ask the shell to complete it as a path."""
         return [CompletionItem(incomplete, type="file")]
 
@@ -285,7 +295,7 @@ store_option = make_click_option("store", "tcpipe-store", options.STORE)
 
 
 def add_path_or_run(name: str, metavar: str, *, required: bool) -> Option:
-    """Return the decorator that declares an argument, a path or a run of the store, and ``--store``; without it, it is the store."""
+    """Return the decorator of an argument (path or run of the store; default: the store) and of ``--store``."""
 
     def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
         @click.pass_context

@@ -1,4 +1,4 @@
-"""Output of commands: progress on stderr, results on stdout. Nothing else in `tcpipe` prints, so that every name is escaped here."""
+"""Output of commands: progress on stderr, results on stdout. Only this module of `tcpipe` prints, and escapes names."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def find_recipe_with_source(explicit: str | None) -> tuple[Path | None, str]:
-    """Return the file of the recipe that rules here, None for the defaults, and where the recipe comes from, for printing."""
+    """Return the file of the active recipe, None for the defaults, and the recipe's source, for printing."""
     from tcpipe.formats.recipe_toml import find_recipe
 
     path = find_recipe(None if explicit is None else Path(explicit), Path.cwd())
@@ -44,7 +44,7 @@ def resolve_recipe_with_source(explicit: str | None) -> tuple[Recipe, str]:
 
 @contextmanager
 def show_progress(what: str, *, quiet: bool, as_json: bool = False) -> Iterator[Progress]:
-    """Show progress on stderr: bars on a terminal, else plain lines, nothing with ``quiet``; with ``--debug`` only its log."""
+    """Show progress on stderr: bars on a terminal, else lines, none with ``quiet``; with ``--debug`` only its log."""
     logger = logging.getLogger("tcpipe")
     debugging = logger.isEnabledFor(logging.DEBUG)
     shown = Progress(what, quiet=quiet, console=None if quiet or debugging else _open_terminal(as_json=as_json))
@@ -78,7 +78,7 @@ _LONGEST_NAME = 40
 
 
 class Progress:
-    """Lines on stderr; on a terminal ``console`` a bar of all logs and the step of the log that reported last, until the end."""
+    """Lines on stderr; on a terminal ``console`` also a bar of all logs and the last reported step, until the end."""
 
     def __init__(self, what: str, *, quiet: bool, console: Console | None) -> None:
         self._what = what

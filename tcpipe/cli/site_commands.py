@@ -46,8 +46,8 @@ def demo(directory: str, *, seed: int, quiet: bool) -> None:
 def init(directory: str, *, source: str | None, robot: str | None, msgdef: str | None) -> None:
     """Write tcpipe.toml, the recipe: every key with its default and its meaning, commented out.
 
-    With --from: what tcpipe finds in PATH (roles, columns, units, power, mounting), with a value of each; what you have to decide is
-    commented out.
+    With --from: what tcpipe finds in PATH (roles, columns, units, power, mounting), with a value of each; what you have
+    to decide is commented out.
     """
     from tcpipe.formats.atomic import clear_beside, write_text
     from tcpipe.formats.recipe_toml import FILE_NAME, format_commented_toml

@@ -4,11 +4,11 @@ The trained model is the prior. With predictions p and measurements y of the met
 
     y = p + X b + e,   b ~ N(0, s² Q),   e ~ N(0, s² S R S)
 
-The columns of X are the spread of a metre (error of a run), p (scale), predicted duration (idle power), rise (payload; 10 % count as a
-metre) and turn (0.3 rad count as a metre), all in the unit of y. S are the stated spreads of a metre, R the correlation of near metres.
-Q has the relative variance q² of the last four for each q of a grid, of which q = 0 means that nothing has changed; the results are
-averaged by their evidence (Gelman et al., Bayesian Data Analysis, 2013, 7.4). s² has an inverse-gamma prior of mean about 1, so that
-predictions have Student's t (ibid., 14.2).
+The columns of X are the spread of a metre (error of a run), p (scale), predicted duration (idle power), rise (payload;
+10 % count as a metre) and turn (0.3 rad count as a metre), all in the unit of y. S are the stated spreads of a metre, R
+the correlation of near metres. Q has the relative variance q² of the last four for each q of a grid, of which q = 0
+means no change; the results are averaged by their evidence (Gelman et al., Bayesian Data Analysis, 2013, 7.4). s² has
+an inverse-gamma prior of mean about 1, so that predictions have Student's t (ibid., 14.2).
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ _RISE_M, _TURN_RAD = 0.1, 0.3
 _FREEDOM = 20.0
 """Weight of the prior of s² [metres]."""
 _PLACE_SHARE, _PLACE_M = 0.2, 30.0
-"""Share of the variance of errors that metres within a distance have in common [1], and that distance [m]; held-out samples show less."""
+"""Share of the variance of errors that metres within a distance have in common [1], and that distance [m]; held-out
+samples show a smaller share."""
 
 
 @dataclass(frozen=True, slots=True)

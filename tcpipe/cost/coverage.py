@@ -1,4 +1,4 @@
-"""How many labels or drives lie inside their prediction intervals, and whether that shows intervals that are too narrow or too wide."""
+"""Share of labels or drives inside their prediction intervals, and whether the intervals are too narrow or wide."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class Coverage:
         """Return the share in percent with its interval."""
         if self.low is None or self.high is None:
             return f"{100.0 * self.fraction:.1f} % ({self.runs} runs are too few for an interval)"
-        return f"{100.0 * self.fraction:.1f} % (95 % CI {100.0 * self.low:.1f} to {100.0 * self.high:.1f}, {self.runs} runs)"
+        interval = f"95 % CI {100.0 * self.low:.1f} to {100.0 * self.high:.1f}"
+        return f"{100.0 * self.fraction:.1f} % ({interval}, {self.runs} runs)"
 
 
 _FEWEST_RUNS = 5
@@ -40,8 +41,9 @@ _FEWEST_RUNS = 5
 def measure_coverage(is_inside: Mask, runs: NDArray[np.generic]) -> Coverage:
     """Return the share of samples that are inside, and its binomial interval, clustered by run.
 
-    Samples of one run err alike, so that they count as fewer: as many as have the variance that the runs show, less for the few degrees of
-    freedom of that variance (Korn and Graubard, Survey Methodology 24, 1998); then Clopper and Pearson's interval.
+    Errors of one run are correlated, so that its samples count as fewer: as many as the variance between runs shows,
+    less for the few degrees of freedom of that variance (Korn and Graubard, Survey Methodology 24, 1998); then the
+    interval of Clopper and Pearson.
     """
     _, at = np.unique(runs, return_inverse=True)
     share, samples, groups = float(is_inside.mean()), len(is_inside), int(at.max()) + 1

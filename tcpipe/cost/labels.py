@@ -1,14 +1,16 @@
-"""w, v, T, E of a segment, their σ for the *true* metre, and the error budget of E (paper, section IV; docs/explanation/rulings.md).
+"""w, v, T, E of a segment, their σ for the *true* metre, and the error budget of E (paper IV; explanation/rulings.md).
 
-The truth of a label is the cost of the true metre that begins where and when the segment does. If the estimated ends are 1 m apart
-but the true ones 1 m + e, the true metre ends e / v_end earlier than the segment, with v_end and P_end the speed and power there::
+The truth of a label is the cost of the true metre that begins where and when the segment does. If the estimated ends
+are 1 m apart but the true ones 1 m + e, the true metre ends e / v_end earlier than the segment, with speed v_end and
+power P_end there::
 
     T_true = T - e / v_end        E_true = E - P_end e / v_end
 
-so an error e of the displacement between both ends, whose standard deviation counts their correlation, is an error of every label.
+so an error e of the displacement between both ends, whose standard deviation includes their correlation, is an error of
+every label.
 
-Part of σ is one error of all segments of a run: the scale of a lone odometry, gain and zero of the power sensor, the idle power. It has
-columns of its own, since it adds up linearly over a path, while the rest averages out.
+Part of σ is one error common to all segments of a run: the scale of a lone odometry, gain and zero of the power sensor,
+the idle power. It has separate columns, since it adds up linearly over a path, while the rest averages out.
 
 Quality bits of labels; none of them removes a segment.
 """
@@ -70,7 +72,7 @@ class SensorError:
     sign_joule: Floats | float = 0.0
 
     def std_joule(self, energy_joule: Floats, *, of_net_energy: bool = False) -> Floats:
-        """Return the standard deviation of energies [J], shape (M,); the idle power contains the offset, so that net energy does not."""
+        """Return the standard deviation of energies [J], shape (M,); net energy has no offset by the idle power."""
         variance = (self.gain_fraction * energy_joule) ** 2 + np.square(self.sign_joule)
         return np.asarray(np.sqrt(variance if of_net_energy else variance + np.square(self.offset_joule)))
 
@@ -87,13 +89,13 @@ def compute_labels(
     common_displacement_std_m: Floats | float = 0.0,
     sensor: SensorError = SensorError(),
 ) -> Labels:
-    """Return w, v, T, E with T = d / v and E = w d / v as identities, and their standard deviations; every array has shape (M,).
+    """Return w, v, T = d / v and E = w d / v (identities) and their standard deviations; every array has shape (M,).
 
     Parameters
     ----------
     chord_m, duration_s : [m], [s], both > 0.
     energy_joule : [J]; NaN without power.
-    end_velocity_mps, end_power_watt : [m/s], [W], at the segment's end; the speed counts as at least a tenth of the mean.
+    end_velocity_mps, end_power_watt : [m/s], [W], at the segment's end; the speed is at least a tenth of the mean.
     displacement_std_m : [m], of the displacement between both estimated ends, their correlation counted.
     energy_noise_joule : [J], from sampling, noise and quantisation of the power, independent of the displacement.
     common_displacement_std_m : [m], the part of the displacement's that is one error of the run.
@@ -131,10 +133,10 @@ def subtract_idle_power(
     energy_noise_joule: Floats,
     sensor: SensorError = SensorError(),
 ) -> dict[str, Floats]:
-    """Return the columns of net labels, shape (M,): E_true = E - P0 T - (P_end - P0) e / v_end, as in the head of this module.
+    """Return columns of net labels, shape (M,): E_true = E - P0 T - (P_end - P0) e / v_end (see the module).
 
-    ``idle_watt`` is P0, the idle power, NaN if unknown; the error of P0 is one error of a whole run. Again E = w d / v. The other
-    parameters are those of `compute_labels`.
+    ``idle_watt``: P0, the idle power, NaN if unknown; the error of P0 is common to a whole run. Again E = w d / v. The
+    other parameters are those of `compute_labels`.
     """
     energy_joule = cost.energy_joule - idle_watt * cost.duration_s
     known = np.isfinite(energy_joule)
@@ -160,7 +162,8 @@ def subtract_idle_power(
 def estimate_energy_budget(energy_joule: Floats, variance_j2: Mapping[str, Floats]) -> EnergyBudget | None:
     """Return the noise floor of E, shape (M,) [J], NaN without a label; None without energies.
 
-    ``variance_j2`` has variances, shape (M,) [J²], of the `CAUSES`, which are independent and add up, and of other keys of the budget.
+    ``variance_j2``: variances, shape (M,) [J²], of the `CAUSES`, which are independent and add up, and of other keys of
+    the budget.
     """
     known = np.isfinite(energy_joule)
     mean_joule = float(np.abs(energy_joule[known]).mean()) if known.any() else 0.0
@@ -222,9 +225,9 @@ def is_too_slow(rate_hz: float, *, averaged: bool) -> bool:
 
 
 def has_low_power_rate(rails: list[Rail]) -> bool:
-    """Return whether the current of any rail comes more slowly than 10 Hz (averaged by its source: 2 Hz), or a voltage that varies.
+    """Return whether a rail has current below 10 Hz (averaged by its source: 2 Hz), or a varying voltage below it.
 
-    A voltage varies where it changes by more than 2 % (root mean square) from sample to sample; a battery's mostly does by less.
+    A voltage varies if its RMS change from sample to sample exceeds 2 %; a battery's mostly changes less.
     """
     return any(
         _is_slow(each.current, each) or (_is_slow(each.voltage, each) and _is_varying(each.voltage)) for each in rails
@@ -255,7 +258,7 @@ def touches_voltage_outside(
 
 
 def spans_near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: float) -> Mask:
-    """Return which spans of path length [m], shape (M,), have one of the positions [m], shape (G,), inside or nearer than ``within_m``."""
+    """Return the spans of path length [m], (M,), with a position [m], (G,), inside or nearer than ``within_m``."""
     ordered = np.sort(position_m)
     first = np.searchsorted(ordered, start_m - within_m, side="left")
     last = np.searchsorted(ordered, end_m + within_m, side="right")
@@ -263,7 +266,7 @@ def spans_near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: 
 
 
 def has_slip(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> Mask:
-    """Return where wheel and body speed differ by more than a share of the wheel speed, shape (M,); not where it is unknown.
+    """Return where wheel and body speed differ by over a share of the wheel speed, shape (M,); False if unknown.
 
     Both are means over the segment along the body's x axis [m/s]: along the slope, not horizontal.
     """
@@ -271,5 +274,5 @@ def has_slip(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> Ma
 
 
 def has_mean_mismatch(mean_watt: Floats, power_watt: Floats, *, above: float = 0.05) -> Mask:
-    """Return where the plain mean of the power samples is off the time-weighted mean by more than a share of it; not where unknown."""
+    """Return where plain and time-weighted mean power differ by more than a share of the latter; False if unknown."""
     return np.abs(mean_watt - power_watt) > above * np.abs(power_watt)

@@ -1,20 +1,20 @@
-"""A physics model of a robot's power, fitted to its labels (idle, drivetrain, rolling, grade, turning), and its error on held-out blocks.
+"""Physics model of power fitted to labels (idle, drivetrain, rolling, grade, turning), and its held-out error.
 
 On a slope that rises by tan(s) a robot of weight m g at horizontal speed v does the mechanical work
 
-    m g v (c + tan(s))                                  (rolling resistance m g c cos(s), grade m g sin(s), along the surface)
+    m g v (c + tan(s))               (rolling resistance m g c cos(s), grade m g sin(s), along the surface)
 
-a second, and a skid-steered one drags its wheels sideways with a torque that hardly depends on how fast it turns. The drive needs
-1 / efficiency of both, and gives back a share of what is negative (the slope drives the wheels)::
+a second, and a skid-steered one drags its wheels sideways with a torque that hardly depends on the yaw rate. The drive
+needs 1 / efficiency of both, and gives back a share of negative work (the slope drives the wheels)::
 
     P = P0 + D v / cos(s) + g(F v + N v tan(s) + M |yaw rate|),   g(x) = x for x > 0, k x for x < 0
 
-P0 is the idle power, D [N] the loss of motors and gears as soon as they turn, on any grade and per metre along the surface (of rolling
-the cosine cancels), N = m g / efficiency [N]; F = N c [N] and M [W per rad/s] belong to a terrain class, or to all ground without classes.
-None is negative. The onset of downhill driving distinguishes D from F, and D is a term only where it is observed; else F includes it. They
-are fitted to the force P / v with Huber's weights (Huber 1964; k = 1.345), so that a minority of outliers has little effect. Their standard
-deviations account for correlated neighbours (White's sandwich over blocks of consecutive segments; Cameron and Miller, J. Human Resources
-50, 2015).
+P0 is the idle power, D [N] the loss of turning motors and gears, on any grade, per metre along the surface (for rolling
+the cosine cancels), N = m g / efficiency [N]; F = N c [N] and M [W per rad/s] belong to a terrain class, or to all
+ground without classes. None is negative. The onset of downhill driving distinguishes D from F, and D is a term only
+where it is observed; else F includes it. They are fitted to the force P / v with Huber's weights (Huber 1964; k =
+1.345), so that a minority of outliers has little effect. Their standard deviations account for correlated neighbours
+(White's sandwich over blocks of consecutive segments; Cameron and Miller, J. Human Resources 50, 2015).
 """
 
 from __future__ import annotations
@@ -85,11 +85,12 @@ class FitSamples:
 
 @dataclass(frozen=True, slots=True)
 class Physics:
-    """A fit.
+    """Fit of the physics model.
 
     Attributes
     ----------
-    terms : what each coefficient is of: (standing, drivetrain, rolling, grade or turning; terrain class or `ALL`), J of them.
+    terms : term and class of each coefficient (standing, drivetrain, rolling, grade or turning; terrain class or
+        `ALL`), J of them.
     value : P0 [W], D [N], F [N], N [N], M [W per rad/s], shape (J,).
     covariance : of the values, shape (J, J); 0 where a coefficient stands at zero.
     recovered : k, share of downhill work that comes back; 0 unless steep downhill segments determine it.
@@ -105,7 +106,7 @@ class Physics:
     segments: int
 
     def of(self, term: str, terrain: str = ALL) -> tuple[float, float] | None:
-        """Return a coefficient and its standard deviation, that of all ground if the class has none; None without either."""
+        """Return a coefficient and its standard deviation, of all ground if the class has none; None without either."""
         if (term, terrain) in self.terms:
             at = self.terms.index((term, terrain))
             return float(self.value[at]), float(np.sqrt(self.covariance[at, at]))
@@ -135,7 +136,7 @@ class Physics:
         return np.asarray(self.parts_watt(metres).sum(axis=1))
 
     def is_plausible(self) -> bool:
-        """Return whether the fit is possible: rolling costs power, at most as tracks in deep sand, and so does climbing."""
+        """Return whether the fit is possible: rolling and climbing cost power, at most as tracks in sand."""
         rolling = [at for at, (term, _) in enumerate(self.terms) if term in {"rolling", "drivetrain"}]
         resistances = [self.rolling_resistance(name) for term, name in self.terms if term == "rolling"]
         climb = self.of("grade")
@@ -219,9 +220,10 @@ def _build_design_matrix(metres: FitSamples, terms: Sequence[tuple[str, str]]) -
 
 
 def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], idle_watt: float | None) -> Physics:
-    """Return the coefficients by iteratively reweighted least squares on the force P / v; what is measured at halts is one row more.
+    """Return coefficients by iteratively reweighted least squares on the force P / v; halts add one row.
 
-    Of downhill metres force is a product of k and the coefficients: each step solves for both by its tangent (Gauss and Newton).
+    On downhill segments force is a product of k and coefficients: each step solves for both by its tangent
+    (Gauss-Newton).
     """
     always, count = _always(terms), len(terms)
     design = _build_design_matrix(metres, terms) / metres.velocity_mps[:, None]
@@ -266,7 +268,7 @@ def _fit_non_negative(made: Floats, target: Floats) -> Floats:
 def _estimate_covariance(
     made: Floats, off: Floats, weight: Floats, scale: float, *, free: Mask, prior: Floats | None
 ) -> Floats:
-    """Return the covariance of coefficients and k, shape (J + 1, J + 1), by what blocks of consecutive rows leave over."""
+    """Return the covariance of coefficients and k, shape (J + 1, J + 1), by residuals of blocks of consecutive rows."""
     rows = made[:, free] / scale
     length = max(1, min(_BLOCK, len(rows) // _FEWEST_BLOCKS))
     starts = np.arange(0, len(rows), length)
@@ -317,7 +319,7 @@ def fit_and_validate_physics(metres: FitSamples, *, idle_watt: float | None) -> 
 
 
 def _score_held_out(metres: FitSamples, idle_watt: float | None) -> PhysicsScore | None:
-    """Return the score of energies of every fifth of the drive by a fit on the others; None with too few segments to fit."""
+    """Return the score of energies of each fifth of the drive by a fit on the rest; None with too few segments."""
     count = len(metres.power_watt)
     fold = np.arange(count) * _FOLDS // max(count, 1)
     predicted, true = np.full(count, np.nan), metres.power_watt / metres.velocity_mps

@@ -2,26 +2,29 @@
 
 They are, in this order:
 
-* the **bias** of each terrain class: the ratio of its metres' true and predicted sums, less one, as far as it is beyond chance. With
-  b the ratio of a class, b0 that of all and s its standard error over blocks of the drives, b0 + (b - b0) max(0, 1 - s² / (b - b0)²)
-  (James and Stein's positive part; Efron and Morris, JASA 70, 1975), and as far as no single fold of the cross-validation makes it.
-  Predictions are multiplied by it, so that they are centred.
-* the **spread** of one metre, a + c |prediction| + e s, with a factor of the class that few samples hardly move from 1. Here s is the
-  standard deviation that the model itself states of the metre, 0 where it states none: it counts as far as held-out errors follow it.
-  Errors of a single fold vary from fold to fold (by 31 % of networks): spreads are then as much wider as Student's t of 5 degrees of
-  freedom, whose scale is as uncertain.
-* the **correlation** of two metres of one run by their distance, from the products of errors over their spread. A segment's end is the
-  next one's beginning, so that of neighbours may be negative; beyond, it never rises, and distances with few pairs are taken together.
-* the **variance of a run's own error**: variance of the means of runs beyond the correlated errors of their metres, widened
-  by Student's t for few runs.
-* the **common error** of the labels themselves (gain and zero of the power sensor, scale of a lone odometry): held-out samples contain it,
-  so that no residual shows it. Its share of the sum of the labels comes from the columns of their standard deviations.
+* the **bias** of each terrain class: the ratio of its metres' true and predicted sums, minus one, as far as it is
+  beyond chance. With b the ratio of a class, b0 that of all and s its standard error over blocks of the drives: b0 + (b
+  - b0) max(0, 1 - s² / (b - b0)²) (James and Stein's positive part; Efron and Morris, JASA 70, 1975), and no larger
+  than without any single fold of the cross-validation. Predictions are multiplied by it, so that they are centred.
+* the **spread** of one metre, a + c |prediction| + e s, with a factor of the class that few samples hardly move from 1.
+  s is the standard deviation that the model itself predicts, 0 without one: it counts as far as held-out errors follow
+  it. Errors of a single fold vary from fold to fold (by 31 % for networks): spreads are then as much wider as Student's
+  t of 5 degrees of freedom, whose scale is as uncertain.
+* the **correlation** of two metres of one run by their distance, from the products of errors over their spread. A
+  segment's end is the next one's beginning, so that the correlation of neighbours may be negative; beyond, it never
+  rises, and distances with few pairs are combined.
+* the **variance of a run's own error**: variance of the means of runs beyond the correlated errors of their metres,
+  widened by Student's t for few runs.
+* the **common error** of the labels (gain and zero of the power sensor, scale of a lone odometry): held-out samples
+  contain it, so that no residual shows it. Its share of the labels' sum comes from the columns of their standard
+  deviations.
 
-Ground near that of training samples has spreads, correlations and runs of its own, where enough held-out samples are of such ground.
+Ground near training samples has separate spreads, correlations and runs if enough held-out samples are on such ground.
 
-With a_i the spreads and s_i the errors of the biases, what a robot's own sensors measure on a path of costs p_i errs by
-z sqrt(sum_ij a_i a_j rho_ij + (sum_i s_i)²): less, of itself, the longer it is, and never less than a run differs from another. Sensors
-that err as they did in training do not change that. Against the true cost, which a budget is of, their c sum_i |p_i| is added.
+With spreads a_i and errors s_i of the biases, the error of a robot's own measurements on a path of costs p_i is z
+sqrt(sum_ij a_i a_j rho_ij + (sum_i s_i)²): relatively smaller on longer paths, but never less than the difference
+between runs. Sensors with the same errors as in training do not change it. Against the true cost, as for a budget,
+their c sum_i |p_i| is added.
 """
 
 from __future__ import annotations
@@ -73,9 +76,9 @@ class Bias:
 
 @dataclass(frozen=True, slots=True)
 class SumDistribution:
-    """Two halves of normal distributions that meet at the prediction: of the time or energy of a path, as the robot's sensors measure it.
+    """Two half normal distributions that meet at the prediction: of a path's time or energy as the sensors measure it.
 
-    ``common_std`` is the standard deviation of what these sensors measure against the truth.
+    ``common_std``: standard deviation of the sensors' measurement against the truth.
     """
 
     middle: float
@@ -114,8 +117,9 @@ class QuantityErrors:
     of_class : by what it is multiplied, by class id, shape (256,).
     low, high : 5 % and 95 % quantiles of the errors over their spread.
     bias_std : standard error of the class's bias, of the prediction, shape (256,).
-    common_share : standard deviation of the labels' common error, of the prediction; 0 where the labels do not state it.
-    stated_share, usual_stated : what a spread has of the standard deviation that the model states, and its mean over held-out samples.
+    common_share : standard deviation of the labels' common error, of the prediction; 0 if the labels state none.
+    stated_share, usual_stated : share of the model's standard deviation in the spread, and its mean over held-out
+        samples.
     lag_m, correlation : of two metres so far apart on one run, from each lag to the next.
     of_run : variance of a run's own error over its spread, raised for the small number of runs.
     runs, samples : that were held out.
@@ -136,12 +140,13 @@ class QuantityErrors:
     stated_share: float = 0.0
     usual_stated: float = 0.0
     near: QuantityErrors | None = None
-    """Errors near training ground, the others being away from it; None where too few held-out samples are near others."""
+    """Errors near training ground, the outer ones being for other ground; None with too few such held-out samples."""
 
     def compute_std(self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None) -> Floats:
         """Return the standard deviation of each prediction, shape (N,).
 
-        ``stated`` is that by the model, None: as usual; ``is_near``, shape (N,), what is near training ground, None: nothing.
+        ``stated``: the model's standard deviation, None: as usual; ``is_near``: near training ground, shape (N,), None:
+        none is.
         """
         own = self.stated_share * (self.usual_stated if stated is None else stated)
         std = np.asarray((self.floor + self.share * np.abs(predicted) + own) * self.of_class[class_id])
@@ -161,7 +166,7 @@ class QuantityErrors:
     def compute_sum(
         self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None
     ) -> SumDistribution:
-        """Return the distribution of the sum over segments of about a metre, in order along the path; shape (N,), NaN counts as none."""
+        """Return the distribution of a path's sum over segments of about 1 m in order; shape (N,), NaN counts as 0."""
         known = np.isfinite(predicted)
         values = np.where(known, predicted, 0.0)
         spread = np.where(known, self.compute_std(values, class_id, stated, is_near), 0.0)
@@ -185,9 +190,10 @@ class QuantityErrors:
         return SumDistribution(middle, below, above, self.common_share * float(size.sum()))
 
     def compute_variance(self, spread: Floats, of_run: float) -> float:
-        """Return the variance sum_ij a_i a_j rho_ij of a sum over path segments of about a metre by their spreads, shape (N,).
+        """Return a path sum's variance sum_ij a_i a_j rho_ij by spreads of path segments of about 1 m, shape (N,).
 
-        ``of_run`` is the variance of a run's own error: all beyond the least correlation, that of a run, is of the metres.
+        ``of_run``: variance of a run's own error; correlation beyond the least one, that of a run, belongs to the
+        metres.
         """
         spectrum = np.fft.rfft(spread, 2 * spread.size)
         pairs = np.fft.irfft(np.abs(spectrum) ** 2, 2 * spread.size)[: spread.size]  # sums of a_i a_j by lag
@@ -224,11 +230,12 @@ def _fit_bias_correction(held: _Held) -> BiasCorrection:
 
 
 def fit_errors(residuals: Residuals) -> dict[str, QuantityErrors] | None:
-    """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
+    """Return the errors of power, velocity, duration and energy of a metre; None with under `FEWEST` held-out samples.
 
-    ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted; where known
-    also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule, the stated errors (`make_residuals`), and
-    the predictions `NEAR` by models of other runs, of samples on ground that these drove.
+    ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as
+    predicted; if known also fold, duration_s of its segment, duration_common_std_s and energy_common_std_joule, the
+    stated errors (`make_residuals`), and the predictions `NEAR` by models of other runs, of samples on ground that
+    these drove.
     Without columns of power the errors are those of velocity and duration.
     """
     held = _Held.collect(residuals)
@@ -281,9 +288,9 @@ _STATED = "power_predicted_std_watt", "velocity_predicted_std_mps", "power_veloc
 
 
 def make_residuals(labels: Floats, mean: Floats, covariance: Floats) -> dict[str, Floats]:
-    """Return columns of labels and predictions of power and velocity, shape (N, 2); of covariances, (N, 2, 2), where they are not 0.
+    """Return columns of labels and predictions (power, velocity), (N, 2), and of nonzero covariances, (N, 2, 2).
 
-    Of velocity alone the shapes are (N, 1) and (N, 1, 1).
+    For velocity alone the shapes are (N, 1) and (N, 1, 1).
     """
     if labels.shape[1] == 1:
         of_velocity = {_STATED[1]: np.sqrt(covariance[:, 0, 0])} if covariance.any() else {}
@@ -297,7 +304,7 @@ def make_residuals(labels: Floats, mean: Floats, covariance: Floats) -> dict[str
 
 
 def propagate_stated(mean: Floats, covariance: Floats) -> dict[str, Floats]:
-    """Return standard deviations of power, velocity, and of time and energy of a metre, to first order in the covariances stated."""
+    """Return first-order σ of power, velocity, and time and energy of a metre, by the model's own covariances."""
     (power, velocity), (of_power, both), (_, of_velocity) = mean.T, *covariance.transpose(1, 2, 0)
     energy = of_power - 2.0 * both * power / velocity + of_velocity * (power / velocity) ** 2
     variances = {
@@ -396,9 +403,10 @@ def _fit_bias(predicted: Floats, true: Floats, held: _Held) -> Bias:
 
 
 def _drop_bias_of_a_fold(found: float, usual: float, predicted: Floats, true: Floats, fold: Ints) -> float:
-    """Return how far a bias is from the usual one whichever fold is left out, added to it.
+    """Return the usual bias plus the difference from it that remains without any single fold.
 
-    A fold whose ground the others hardly have is predicted by a model that lacks it; the model of all samples has it, and not that bias.
+    A fold of ground that is rare in the others is predicted by a model that lacks it; the model of all samples does not
+    have that bias.
     """
     folds = np.unique(fold)
     if folds.size < 2:
@@ -412,7 +420,7 @@ def _drop_bias_of_a_fold(found: float, usual: float, predicted: Floats, true: Fl
 
 
 def _estimate_ratio(predicted: Floats, true: Floats, block: Ints) -> tuple[float, float]:
-    """Return the ratio of true and predicted sums, less one, and its standard error over blocks; of a single block the ratio itself."""
+    """Return the ratio of true to predicted sums, minus one, and its standard error over blocks (one: the ratio)."""
     whole = float(np.abs(predicted).sum())
     if not whole:
         return 0.0, 0.0
@@ -458,8 +466,8 @@ def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Fl
 def _estimate_run_variance(errors: QuantityErrors, error: Floats, spread: Floats, run: Ints) -> float:
     """Return the variance of a run's own error over its spread, beyond what errors of its metres leave in its mean.
 
-    It is raised so that a normal interval of the mean error of a new run is as wide as Student's t wants it. Runs count by their length
-    (DerSimonian and Laird, Controlled Clinical Trials 7, 1986).
+    It is raised so that a normal interval of the mean error of a new run is as wide as that of Student's t. Runs count
+    by their length (DerSimonian and Laird, Controlled Clinical Trials 7, 1986).
     """
     runs = np.unique(run)
     if runs.size < 2:  # nothing but the farthest metres tell it
@@ -474,7 +482,7 @@ def _estimate_run_variance(errors: QuantityErrors, error: Floats, spread: Floats
 
 
 def _estimate_correlation(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
-    """Return lags and the correlation from each on; the farther half of all pairs are together, since runs end somewhere."""
+    """Return lags and the correlation from each on; the farther half of pairs share one, since runs end somewhere."""
     products, far_m = _pair_errors(standard, held)
     order = np.argsort(far_m, kind="stable")
     products, far_m, far_pairs = products[order], far_m[order], max(far_m.size // 2, _FEWEST_PAIRS)

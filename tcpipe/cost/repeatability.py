@@ -1,9 +1,10 @@
-"""How well labels repeat themselves where the robot drove the same ground twice in the same direction (docs/how-to/trust.md).
+"""Repeatability of labels where the robot drove the same ground twice in one direction (docs/how-to/trust.md).
 
-A model that knows the ground alone cannot distinguish two passes. Two passes of one place and direction give
-s² = (r1 - r2)² / 2 of their residuals r; the mean over P pairs that share no sample is the variance of one pass. Its interval is a
-jackknife over blocks of ground, since the pairs of one block are not independent (Efron and Tibshirani, *An Introduction to the
-Bootstrap*, 1993, chapter 11). The offset between two footprints makes the figure rather too large than too small.
+A model that knows only the ground cannot distinguish two passes. Two passes of one place and direction give s² = (r1 -
+r2)² / 2 of their residuals r; the mean over P pairs without common samples is the variance of one pass. Its interval is
+a jackknife over blocks of ground, since the pairs of one block are not independent (Efron and Tibshirani, *An
+Introduction to the Bootstrap*, 1993, chapter 11). The offset between two footprints makes the figure rather too large
+than too small.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ NEAR = 0.25
 """Footprints whose centres are at most so many chords apart are one place."""
 
 ALONG_RAD = np.radians(10.0)
-"""Courses that differ by at most so much are one direction [rad]; NEAR and this bound the two together, as an ellipsoid."""
+"""Largest difference of courses of one direction [rad]; with NEAR it bounds position and course as an ellipsoid."""
 
 _CHUNK = 65_536
 """Samples whose nearest are looked for together."""
@@ -48,10 +49,10 @@ _CONFIDENCE = 0.95
 def find_repeated_pairs(
     xy_m: Floats, course_rad: Floats, terrain_class: NDArray[np.integer], *, chord_m: float
 ) -> Ints:
-    """Return pairs of samples that cover one place of one class in one direction, shape (P, 2); no sample is in two pairs.
+    """Return pairs of samples of one place, class and direction, shape (P, 2); no sample is in two pairs.
 
     Samples of one pass never qualify: they begin a chord apart. Of several passes the two nearest are the pair.
-    ``xy_m`` are centres of the footprints [m], shape (N, 2), ``course_rad`` their directions of travel [rad], shape (N,).
+    ``xy_m``: centres of the footprints [m], shape (N, 2); ``course_rad``: directions of travel [rad], shape (N,).
     """
     if len(xy_m) < 2:
         return np.empty((0, 2), np.int64)
@@ -75,9 +76,10 @@ def find_repeated_pairs(
 def estimate_repeatability(
     values: Floats, residual: Floats, pairs: Ints, xy_m: Floats, *, chord_m: float
 ) -> Floor | None:
-    """Return how well a label repeats itself over ``pairs``, shape (P, 2); None without pairs.
+    """Return the repeatability of a label over ``pairs``, shape (P, 2); None without pairs.
 
-    ``values`` and ``residual`` are the label and its `compute_slope_residuals`, shape (N,), ``xy_m`` centres of the footprints [m], (N, 2).
+    ``values``, ``residual``: the label and its `compute_slope_residuals`, shape (N,); ``xy_m``: centres of the
+    footprints [m], (N, 2).
     """
     if not len(pairs):
         return None

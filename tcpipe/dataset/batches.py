@@ -1,4 +1,4 @@
-"""Stored layers of a split, from memory or piece by piece, and its batches: numpy arrays for Keras, JAX, torch or any loop."""
+"""Stored layers of a split, in memory or piece by piece, and its batches for Keras, JAX, torch or any loop."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class StoredPixels:
         return len(self.rows) * sum(self.files.make_room(layer, 1).nbytes for layer in layers) <= IN_MEMORY_BYTES
 
     def in_memory(self, layers: tuple[str, ...]) -> Pixels:
-        """Return the layers of all samples, and others that were asked for before, read once and kept, each of shape (N, px, px)."""
+        """Return the layers of all samples, shape (N, px, px) each, read once and kept with those of earlier calls."""
         absent = [layer for layer in layers if layer not in self._memory]
         if absent:
             self._memory.update(self._read(self.rows, absent))
@@ -71,8 +71,9 @@ class StoredPixels:
     ) -> Iterator[tuple[Pixels, Ints, Ints]]:
         """Yield the samples ``at``, shape (M,), in pools of ``pieces`` pieces, each piece decoded once.
 
-        Yielded are arrays of the pool, which the next one overwrites; rows in them, and which of ``at`` these are, both (B,). The first
-        ``spare`` rows are the caller's. ``rng`` shuffles the pieces and the samples within each pool; None keeps the order of the files.
+        Yields the pool's arrays, which the next pool overwrites; rows in them, and their numbers in ``at``, both (B,).
+        The first ``spare`` rows are the caller's. ``rng`` shuffles the pieces and the samples within each pool; None
+        keeps the order of the files.
         """
         files, rows, piece_of = self.files, self.rows[at], self.find_pieces(at)
         order = np.argsort(piece_of, kind="stable")
@@ -132,8 +133,8 @@ class SampleView:
 class Batches:
     """Batches of one split; iterating again is the next epoch, with its own shuffle.
 
-    Each batch is ``(patches, labels)``, or ``(patches, labels, weights)`` with ``weights``, a weight for each label; with ``features``,
-    patches are replaced by ``(patches, features)``.
+    Each batch is ``(patches, labels)``, or ``(patches, labels, weights)`` with ``weights``, a weight for each label;
+    with ``features``, patches are replaced by ``(patches, features)``.
     """
 
     view: SampleView
@@ -192,7 +193,7 @@ class Batches:
                 yield self._batch(pixels, rows[cut], samples[cut], mirrors)
 
     def _iterate_full(self, rng: np.random.Generator) -> Iterator[tuple[Pixels, Ints, Ints]]:
-        """Yield pixels, rows in them and the samples that these are: whole batches, but for the last ones of the epoch."""
+        """Yield pixels, rows in them and their samples, in whole batches except for the last ones of the epoch."""
         view, mine = self.view, self._samples
         layers = view.form.layers
         if not self.from_disk:

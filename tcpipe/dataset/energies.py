@@ -32,7 +32,7 @@ ENERGIES: Mapping[str, Energy] = {
 
 
 def name_common_std(column: str) -> str:
-    """Return the name of the part of a standard deviation that is one error of all labels of a run, by that of the whole."""
+    """Return the name of a standard deviation's part that is one error of all labels of a run."""
     return column.replace("_std_", "_common_std_")
 
 

@@ -1,4 +1,4 @@
-"""A dataset as a mapping of its splits: patches and labels as arrays, as batches, and as a map-style dataset for any trainer."""
+"""A dataset as a mapping of its splits: patches and labels as arrays, as batches, and as a map-style dataset."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class SampleColumns:
 
 @dataclass(eq=False, repr=False)
 class Split:
-    """Samples of one split, in the dataset's order; every method that narrows it returns another one over the same files.
+    """Samples of one split, in the dataset's order; methods that narrow it return another one over the same files.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class Split:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The tensor's channels: ortho, terrain, height, or those of them that the map has, unless others were asked for."""
+        """Channels of the tensor: the requested ones, else ortho, terrain and height as far as the map has them."""
         return self.view.form.channels
 
     @property
@@ -138,7 +138,7 @@ class Split:
 
     @property
     def label_columns(self) -> tuple[str, ...]:
-        """Columns of samples.parquet that train: the power of its energy, and the velocity of the card; without energy, velocity alone."""
+        """Columns of samples.parquet that train: power of its energy, and the card's velocity (alone if no energy)."""
         velocity = self._card.label.columns[1]
         return (self.energy.power, velocity) if self.has_energy else (velocity,)
 
@@ -167,7 +167,7 @@ class Split:
         return self._columns[name][self.view.at]
 
     def own_std(self, name: str) -> Floats:
-        """Return the standard deviation ``name`` of each label without the part that all labels of a run share, shape (N,)."""
+        """Return σ ``name`` of each label without the part that is common to all labels of a run, shape (N,)."""
         total = self.column(name).astype(np.float64)
         shared = np.nan_to_num(self.column(name_common_std(name)).astype(np.float64))
         return np.sqrt(np.maximum(total**2 - shared**2, 0.0))
@@ -184,7 +184,7 @@ class Split:
         return patches, self.labels[at]
 
     def with_channels(self, *channels: str) -> Split:
-        """Return the split with these channels: layers by name, or ``terrain_one_hot`` (a channel a class; of any categorical layer)."""
+        """Return the split with channels: layers by name, or ``terrain_one_hot`` (one a class; any classes)."""
         files = self.view.stored.files
         form = make_tensor_layout(channels, files.layers, files.patch_px)
         return replace(self, view=replace(self.view, form=form))
@@ -202,7 +202,8 @@ class Split:
 
         Parameters
         ----------
-        ids : ids; or a file with them, as the dataset's page writes it: a CSV with a column ``sample_id``, or one id a line.
+        ids : ids; or a file with them, as written by the dataset's page: a CSV with a column ``sample_id``, or one id a
+            line.
 
         Raises
         ------
@@ -247,7 +248,7 @@ class Split:
         return self.take(good)
 
     def fold(self, number: int) -> tuple[Split, Split]:
-        """Return the split without a fold of spatial cross-validation, and that fold: to fit on, and to stop early by."""
+        """Return the split without a fold of spatial cross-validation, to fit, and that fold, for early stopping."""
         held = self.column("fold") == number
         return self.take(~held), self.take(held)
 
@@ -268,10 +269,13 @@ class Split:
         Parameters
         ----------
         size : samples in a batch, 1 or more.
-        shuffle, seed : another order every epoch, drawn from the seed; from disk, samples are shuffled within pools of shuffled chunks.
-        mirror : mirror every other sample across its direction of travel, at random: rows of the patch are reversed, its labels stay true.
+        shuffle, seed : another order every epoch, drawn from the seed; from disk, samples are shuffled within pools of
+            shuffled chunks.
+        mirror : mirror every other sample across its direction of travel, at random: rows of the patch are reversed,
+            labels are unchanged.
         weights : third element of each batch: `weights`.
-        features : columns of samples.parquet beside the patches: ``slope_rad``, ``cross_slope_rad`` (its sign follows the mirror) ….
+        features : columns of samples.parquet beside the patches: ``slope_rad``, ``cross_slope_rad`` (its sign follows
+            the mirror) ….
         drop_last : leave out a last batch that is not full.
         from_disk : decode chunk by chunk instead of keeping the split in memory; None decides by its size.
         """
@@ -297,7 +301,7 @@ class Split:
         )
 
     def torch_iterable(self, size: int, **rules: Any) -> TorchBatches:
-        """Return `batches` as an iterable torch dataset, for ``DataLoader(…, batch_size=None, num_workers=n)``; imports torch."""
+        """Return `batches` as an iterable torch dataset for ``DataLoader(…, batch_size=None, num_workers=n)``."""
         from tcpipe.dataset.torch_data import TorchBatches  # noqa: PLC0415  torch only when it is asked for
 
         return TorchBatches(self.batches(size, **rules))
@@ -305,7 +309,8 @@ class Split:
     def _require_patches(self) -> None:
         if not self.channels:
             raise DatasetError(
-                f"{self._columns.directory}: has no patches; take its samples and labels, or add a map (tcpipe add-map) and build it again"
+                f"{self._columns.directory}: has no patches; "
+                "take its samples and labels, or add a map (tcpipe add-map) and build it again"
             )
 
     def _form_tensor(self, indices: Ints) -> Floats32:
@@ -383,10 +388,12 @@ def open_dataset(path: Location, *, layers: Sequence[str] | None = None, label: 
 
     Parameters
     ----------
-    path : its directory, of either format, or the URL of one in a bucket (``s3://…``): patches are fetched when they are read, and cached.
-    layers : the tensor's channels, in this order; None: the paper's ``ortho``, ``terrain``, ``height``, as far as the dataset has them.
-    label : which energy the labels are of: ``total``, all that the power source measured, or ``net``, less what the robot draws
-        while it stands. T = d / v and E = w d / v hold for either.
+    path : its directory, of either format, or the URL of one in a bucket (``s3://…``): patches are fetched when they
+        are read, and cached.
+    layers : the tensor's channels, in this order; None: the paper's ``ortho``, ``terrain``, ``height``, as far as the
+        dataset has them.
+    label : which energy the labels are of: ``total``, as measured by the power source, or ``net``, without the idle
+        power. T = d / v and E = w d / v are valid for both.
 
     Raises
     ------
@@ -405,7 +412,8 @@ def open_dataset(path: Location, *, layers: Sequence[str] | None = None, label: 
     if not has_energy and label != "total":
         cause = "the robot was never stationary for long; take the label total"
         raise DatasetError(
-            f"{directory}: no sample has {energy.power}: {cause if card.labels.get('energy') else 'the runs have no power'}"
+            f"{directory}: no sample has {energy.power}: "
+            f"{cause if card.labels.get('energy') else 'the runs have no power'}"
         )
     files = open_patches(directory, card, fetched)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers

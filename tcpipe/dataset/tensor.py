@@ -41,7 +41,7 @@ def form_numbers(  # noqa: PLR0917
     channel: int,
     out: Floats32,
 ) -> None:
-    """Write numbers of ``rows``, scaled and clipped to [0, 1], to one channel of ``out``, (B, px, px, C); NaN and ``nodata`` become 0."""
+    """Write ``rows``, scaled and clipped to [0, 1], to a channel of ``out``, (B, px, px, C); NaN, ``nodata``: 0."""
     px, none, whole = out.shape[1], np.float32(0.0), np.float32(1.0)
     for b in range(rows.size):
         n = rows[b]

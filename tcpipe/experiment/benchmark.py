@@ -1,4 +1,4 @@
-"""``tcpipe benchmark``: the paper's table for every kind of model and dataset, with its uncertainty between runs and trainings.
+"""``tcpipe benchmark``: the paper's table for all kinds of models and datasets, with intervals over runs, trainings.
 
 ::
 
@@ -59,7 +59,7 @@ class BenchmarkRow:
     terrain: str
     """Name of a class, or ``all``."""
     rmse: Ratio
-    """Mean over trainings in the quantity's unit, with its 95 % interval over runs and trainings; None below five runs."""
+    """Mean over trainings in the quantity's unit, with 95 % interval over runs and trainings; None below five runs."""
     mape_percent: float | None
     coverage_percent: float | None = None
     """Coverage of 90 % intervals. This and the next two are known for all classes together only."""
@@ -199,7 +199,8 @@ def _summarize(  # noqa: PLR0917
 def estimate_rmse(off: Floats, runs: NDArray[np.str_]) -> Ratio:
     """Return the root mean square of errors, shape (trainings, N), with its 95 % interval.
 
-    The variance of the mean square is that between runs, whose samples err alike, and that between trainings over their number.
+    The variance of the mean square is that between runs, whose samples correlate, and that between trainings over their
+    number.
     """
     if not off.size:
         return Ratio(None, None, None)

@@ -1,6 +1,7 @@
 """Claims of the paper (section V) that the simulated site can refute, as ratios of errors.
 
-The importance of height, class, several classes and slow ground is built into the site (docs/reference/simulation.md) and is no claim.
+The importance of height, class, several classes and slow ground is built into the site (docs/reference/simulation.md)
+and is no claim.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ class Claim:
     """Standard deviation of the ratio's logarithm between trainings; None of one."""
     in_the_paper: float | None
     verdict: Verdict
-    """``held``: the whole 95 % interval is below 1; ``NOT held``: above; ``open``: it contains 1, or trainings or groups are too few."""
+    """``held``: the whole 95 % interval is below 1; ``NOT held``: above; ``open``: it contains 1, or trainings or
+    groups are too few."""
 
     def __str__(self) -> str:
         """Return the claim, its figure and its verdict as one line."""
@@ -78,8 +80,8 @@ def _find_result(run: Sequence[BaselineResult], baseline: str, split: str) -> Ba
 def _combine_ratios(rows: Sequence[BaselineResult], seeds: int) -> tuple[Ratio, float | None]:
     """Return the mean ratio with its interval, and the standard deviation between trainings.
 
-    The variance of the mean logarithm is that of the trainings, over their number, and that of the samples, which are the same for all of
-    them: that of the bootstrap. Degrees of freedom are Welch and Satterthwaite's.
+    The variance of the mean logarithm is that of the trainings, over their number, and that of the samples, which all
+    trainings share: that of the bootstrap. Degrees of freedom are Welch and Satterthwaite's.
     """
     values = [row.rmse_ratio.value for row in rows if row.rmse_ratio.value is not None]
     if len(values) < seeds:

@@ -1,4 +1,4 @@
-"""Networks beside the paper's one (table IV): one per class with all layers, and Wei and Isler's, which predict E from heights alone.
+"""Networks of table IV: one per class with all layers, and Wei and Isler's, which predict E from heights alone.
 
 Each takes as many steps as the one network, and is centred by class by the same rule.
 """
@@ -105,7 +105,7 @@ Networks = Mapping[int, tuple[Samples, Fitted]]
 
 
 def _fit_by_class(kind: type[NetworkModel], samples: Samples, place: Path, fitted: int) -> Networks:
-    """Return a network for every class with enough samples, by class id, after as many steps as one of ``fitted`` samples."""
+    """Return a network for each class with enough samples, by class id, with as many steps as ``fitted`` samples."""
     found, class_id, config = dict[int, tuple[Samples, Fitted]](), samples.features.class_id, samples.config
     for number in np.unique(class_id[class_id > 0]).tolist():
         own = samples.take(class_id == number)

@@ -50,7 +50,8 @@ SMALL = Experiment(
     "paper_quick",
     FitConfig(epochs=40, patience=8, batch_size=32, learning_rate=1e-3, width=16),
     EvaluateConfig(noise_draws=2),
-    "This is the small site, with a narrow network: three short drives, some 300 training samples. Its figures are not the paper's size.",
+    "This is the small site, with a narrow network: three short drives, some 300 training samples. "
+    "Its figures are not the paper's size.",
 )
 """Some minutes for each training, for claims on few samples."""
 
@@ -58,7 +59,8 @@ QUICK = Experiment(
     "paper_quick",
     replace(SMALL.fitting, epochs=4, patience=4),
     SMALL.evaluating,
-    "This is a quick run: the small site, a narrow network, few epochs. It only shows that all steps run: do not use its numbers.",
+    "This is a quick run: the small site, a narrow network, few epochs. It only shows that all steps run: "
+    "do not use its numbers.",
 )
 """Two minutes on two cores: all steps run; its figures mean nothing."""
 
@@ -200,10 +202,11 @@ def _make_claims_section(claims: Sequence[Claim], audit: str) -> PageSection:
         for claim in claims
     ]  # fmt: skip
     text = (
-        "RMSE of E of the network over a baseline's, of the same samples, with its 95 % interval: below 1 the network is better.\n"
-        "Both are centred by class; the mean of all trainings, its interval over trainings and test samples. Held if all of it is below 1, "
-        f"NOT held if above, open otherwise, and of fewer than {FEWEST_SEEDS} trainings. Height, class and slow ground matter by "
-        f"construction of the site, so they are no claims. {audit}"
+        "RMSE of E of the network over a baseline's, of the same samples, with its 95 % interval: "
+        "below 1 the network is better.\n"
+        "Both are centred by class; the mean of all trainings, its interval over trainings and test samples. "
+        f"Held if all of it is below 1, NOT held if above, open otherwise, and of fewer than {FEWEST_SEEDS} trainings. "
+        f"Height, class and slow ground matter by construction of the site, so they are no claims. {audit}"
     )
     header = ("claim", "split", "", "here", "between trainings (1σ)", "the paper")
     return PageSection("Claims of the paper", text, header=header, rows=rows)

@@ -1,10 +1,11 @@
 """Geodetic coordinates, earth-centred coordinates, and the east-north-up plane of a datum, on the WGS84 ellipsoid.
 
-Other geodetic systems in use (GDA2020, ETRS89, NAD83) are on GRS80, whose semi-minor axis differs by 0.1 mm: their coordinates pass
-through here unchanged in meaning; the system is named beside them (``Datum.crs``) and never changed here.
+Other geodetic systems in use (GDA2020, ETRS89, NAD83) are on GRS80, whose semi-minor axis differs by 0.1 mm: their
+coordinates keep their meaning here; ``Datum.crs`` names the system, and nothing here changes it.
 
-Source: B. Hofmann-Wellenhof, H. Lichtenegger, E. Wasle, "GNSS", Springer 2008, section 8.2 (eq. 8.4 to 8.6) and 8.2.2 (eq. 8.10);
-latitude by Bowring's iteration (B. R. Bowring, Survey Review 23 (181), 1976), repeated until it is exact to rounding.
+Source: B. Hofmann-Wellenhof, H. Lichtenegger, E. Wasle, "GNSS", Springer 2008, section 8.2 (eq. 8.4 to 8.6) and 8.2.2
+(eq. 8.10); latitude by Bowring's iteration (B. R. Bowring, Survey Review 23 (181), 1976), repeated until it is exact to
+rounding.
 """
 
 from __future__ import annotations
@@ -88,6 +89,6 @@ def enu_from_geodetic(
 
 
 def geodetic_from_enu(enu_m: ArrayLike, *, datum_deg_m: tuple[float, float, float]) -> tuple[Floats, Floats, Floats]:
-    """Return longitude [deg], latitude [deg] and height above the ellipsoid [m] of points (..., 3) in a datum's frame [m]."""
+    """Return longitude, latitude [deg] and ellipsoidal height [m] of points (..., 3) in a datum's frame [m]."""
     rotation = ecef_from_enu_rotation(datum_deg_m[0], datum_deg_m[1])
     return geodetic_from_ecef(np.asarray(enu_m, np.float64) @ rotation.T + ecef_from_geodetic(*datum_deg_m))

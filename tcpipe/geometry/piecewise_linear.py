@@ -1,8 +1,9 @@
-"""Signals known at their samples and straight between them: values, integrals, and the integral of a product of two.
+"""Signals known at samples and straight between them: values, integrals, and the integral of a product of two.
 
-The power of a drive is voltage times current, each sampled at its own times. If both are taken as straight between samples, their
-product is a parabola on each interval and its integral has a closed form; the trapezoid of sampled V·I differs from it by up to
-1.15 % a segment on noisy data. Stamps are int64 nanoseconds and strictly increasing; times are elapsed since the first stamp.
+The power of a drive is voltage times current, each sampled at its own times. If both are straight between samples,
+their product is a parabola on each interval and its integral has a closed form; the trapezoid of sampled V·I differs
+from it by up to 1.15 % a segment on noisy data. Stamps are int64 nanoseconds and strictly increasing; times are elapsed
+since the first stamp.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ _NS = 1e-9
 
 
 def interpolate(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
-    """Return the signal at each time, shape (M,), in the unit of ``value``; ends are held beyond the first and last sample."""
+    """Return the signal at each time, shape (M,), in the unit of ``value``; ends are held beyond the samples."""
     origin = stamp_ns[0]
     return np.asarray(np.interp((at_ns - origin) * _NS, (stamp_ns - origin) * _NS, value))
 
@@ -35,9 +36,9 @@ def integrate_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
 
 
 def mean_between(stamp_ns: Ints, value: Floats, start_ns: Ints, end_ns: Ints) -> Floats:
-    """Return the exact time-mean of the signal over each span, shape (M,); NaN where the signal has a NaN that touches the span.
+    """Return the exact time-mean of the signal over each span, shape (M,); NaN where a NaN touches the span.
 
-    Parameters as in `integrate_to`; every span is longer than nothing.
+    Parameters as in `integrate_to`; every span is longer than zero.
     """
     known = np.isfinite(value)
     total, unknown = (
@@ -48,7 +49,7 @@ def mean_between(stamp_ns: Ints, value: Floats, start_ns: Ints, end_ns: Ints) ->
 
 
 def integrate_product_to(stamp_ns: Ints, a: Floats, b: Floats, at_ns: Ints) -> Floats:
-    """Return the exact integral of the product of two piecewise-linear signals on one grid, from its first stamp to each time.
+    """Return the exact integral of the product of two signals on one grid, from its first stamp to each time.
 
     On an interval of length h with end values a0, a1 and b0, b1 it is h (2 a0 b0 + 2 a1 b1 + a0 b1 + a1 b0) / 6.
 
@@ -69,10 +70,10 @@ def integrate_product_to(stamp_ns: Ints, a: Floats, b: Floats, at_ns: Ints) -> F
 
 
 def integrate_held_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
-    """Return the integral of the step signal whose value on an interval is that of its right end, from the first stamp to each time.
+    """Return the integral, from the first stamp, of the step signal with an interval's value at its right end.
 
-    A source that reports the average over the time since its last message means exactly this (right-endpoint rectangle); it is also
-    the sum of the paper's Eq. 1. Parameters as in `integrate_to`.
+    It is exact for a source that reports the average since its last message (right-endpoint rectangle); it is also the
+    sum of the paper's Eq. 1. Parameters as in `integrate_to`.
     """
     step_s = np.diff(stamp_ns) * _NS
     whole = np.concatenate(([0.0], np.cumsum(step_s * value[1:])))

@@ -1,13 +1,14 @@
-"""A driven path between its samples: cubic Hermite interpolation, horizontal arc length, and where it first leaves a circle.
+"""A driven path between samples: cubic Hermite interpolation, horizontal arc length, and first exit from a circle.
 
-The estimated track has position and velocity at 20 Hz; between two samples the path is the one cubic that has both at both ends.
-Every length of the pipeline, segments and loss ledger alike, is measured on this one curve, so that they add up.
-Stamps are int64 nanoseconds and strictly increasing.
-Where they have a hole is the caller's business (docs/explanation/rulings.md, Endpoints and Gaps).
+The estimated track has position and velocity at 20 Hz; between two samples the path is the one cubic that has both at
+both ends. Every length of the pipeline, of segments and of the distance breakdown, is measured on this one curve, so
+that they add up. Stamps are int64 nanoseconds and strictly increasing. The caller handles gaps
+(docs/explanation/rulings.md, Endpoints and Gaps).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,7 +52,7 @@ class Polyline:
     length_m: Floats
 
     def position_at(self, at_ns: Ints) -> Floats:
-        """Return positions at times inside the span: [m], shape (M, 3); at a sample's own stamp its position, exactly."""
+        """Return positions [m], shape (M, 3), at times inside the span; at a sample's stamp exactly its position."""
         row, u, step_s = _locate(self.stamp_ns, at_ns)
         v0, v1 = self.velocity_mps[row] * step_s, self.velocity_mps[row + 1] * step_s
         blend = u * u * (3.0 - 2.0 * u)
@@ -70,10 +71,10 @@ class Polyline:
         )
 
     def first_crossing_ns(self, start_ns: int, *, radius_m: float) -> int | None:
-        """Return the first time at which the path is ``radius_m`` [m] from where it is at ``start_ns``, horizontally; or None.
+        """Return the first time at which the path is horizontally ``radius_m`` [m] from its start position; or None.
 
-        Each interval is looked at in eighths, so that only an excursion of micrometres can pass between two looks. The time is rounded to
-        a nanosecond: the residual is about speed x 0.5 ns. ``radius_m`` is the chord d of the paper's III-A.
+        Each interval is examined in eighths, so that only an excursion of micrometres can be missed. The time is
+        rounded to a nanosecond: the residual is about speed x 0.5 ns. ``radius_m`` is the chord d of the paper's III-A.
         """
         at = np.array([start_ns], dtype=np.int64)
         row, u, _ = _locate(self.stamp_ns, at)
@@ -84,7 +85,7 @@ class Polyline:
 
 
 def fit_polyline(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats) -> Polyline:
-    """Return the path through samples: cubic Hermite between them, its length by 8-node Gauss-Legendre quadrature of its speed.
+    """Return the path through samples: cubic Hermite, with its length by 8-node Gauss-Legendre quadrature of speed.
 
     Parameters
     ----------
@@ -99,7 +100,7 @@ def fit_polyline(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats) -> Po
 
 
 def _locate(stamp_ns: Ints, at_ns: Ints) -> tuple[NDArray[np.intp], Floats, Floats]:
-    """Return each time's interval, its share of it (0 to 1) and the interval's length [s]; the latter two of shape (M, 1)."""
+    """Return each time's interval, its share of it (0 to 1) and the interval's length [s]; the latter two (M, 1)."""
     row = find_row_before(stamp_ns, at_ns)
     step_s = (stamp_ns[row + 1] - stamp_ns[row])[:, None].astype(np.float64) * _NS
     return row, ((at_ns - stamp_ns[row]) * _NS)[:, None] / step_s, step_s
@@ -117,8 +118,10 @@ def _compute_partial_length_m(
 
 
 @compile_kernel
-def _compute_distance_m(position_m, velocity_mps, step_s, u, centre):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """Horizontal distance from a centre at a share u of the interval between two rows."""
+def _compute_distance_m(
+    position_m: Floats, velocity_mps: Floats, step_s: float, u: float, centre: tuple[float, float]
+) -> float:
+    """Return the horizontal distance from a centre at a share u of the interval between two rows."""
     blend = u * u * (3.0 - 2.0 * u)
     total = 0.0
     for axis in range(2):
@@ -126,16 +129,23 @@ def _compute_distance_m(position_m, velocity_mps, step_s, u, centre):  # type: i
         swing = u * (1.0 - u) * ((1.0 - u) * v0 - u * v1)
         off = position_m[0, axis] * (1.0 - blend) + position_m[1, axis] * blend + swing - centre[axis]
         total += off * off
-    return np.sqrt(total)
+    return math.sqrt(total)
 
 
 @compile_kernel
-def _find_first_crossing(stamp_ns, position_m, velocity_mps, start, circle):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    """First stamp at which the path leaves a circle, or -1: the first part of an interval that ends outside is halved."""
+def _find_first_crossing(
+    stamp_ns: Ints,
+    position_m: Floats,
+    velocity_mps: Floats,
+    start: tuple[int, float],
+    circle: tuple[float, float, float],
+) -> np.int64:
+    """Return the first stamp at which the path leaves a circle, or -1; halves the first part that ends outside."""
     row, share = start
     x0, y0, radius_m = circle
     for k in range(row, len(stamp_ns) - 1):
-        step_ns = stamp_ns[k + 1] - stamp_ns[k]
+        begin_ns: np.int64 = stamp_ns[k]
+        step_ns = stamp_ns[k + 1] - begin_ns
         ends = position_m[k : k + 2], velocity_mps[k : k + 2], step_ns * _NS
         low = share if k == row else 0.0
         while low < 1.0:
@@ -147,6 +157,6 @@ def _find_first_crossing(stamp_ns, position_m, velocity_mps, start, circle):  # 
                         low = middle
                     else:
                         high = middle
-                return stamp_ns[k] + np.int64(np.round(high * step_ns))
+                return begin_ns + np.int64(np.round(high * step_ns))
             low = high
     return np.int64(-1)

@@ -1,10 +1,12 @@
 """Rotations: quaternions (x, y, z, w), matrices, rotation vectors, and roll, pitch, yaw of REP-103.
 
-A rotation ``a_from_b`` takes coordinates in b to coordinates in a: ``v_a = a_from_b @ v_b``. Roll, pitch and yaw turn about the fixed
-axes x, y, z in this order: R = Rz(yaw) Ry(pitch) Rx(roll). All functions work on stacks: shape (..., 4), (..., 3) or (..., 3, 3).
+A rotation ``a_from_b`` transforms coordinates in b to coordinates in a: ``v_a = a_from_b @ v_b``. Roll, pitch and yaw
+turn about the fixed axes x, y, z in this order: R = Rz(yaw) Ry(pitch) Rx(roll). All functions work on stacks: shape
+(..., 4), (..., 3) or (..., 3, 3).
 
-Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", 2017 (arXiv 1711.02508), sections 1 to 3; the quaternion
-of a matrix follows S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1 (3), 1978.
+Source: J. Solà, "Quaternion kinematics for the error-state Kalman filter", 2017 (arXiv 1711.02508), sections 1 to 3;
+the quaternion of a matrix follows S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1 (3),
+1978.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ def matrix_from_quat(quat_xyzw: ArrayLike) -> Floats:
 
 
 def quat_from_matrix(rotation: ArrayLike) -> Floats:
-    """Return unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3); the largest component is the divisor."""
+    """Return unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3); divides by the largest component."""
     R = np.asarray(rotation, np.float64)
     trace = np.trace(R, axis1=-2, axis2=-1)
     # Each row is the quaternion times four times one of its own components.
@@ -85,7 +87,7 @@ def quat_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike)
 
 
 def rpy_from_matrix(rotation: ArrayLike) -> Floats:
-    """Return roll, pitch, yaw [rad] (..., 3), each in [-pi, pi), pitch in [-pi/2, pi/2], of rotation matrices (..., 3, 3)."""
+    """Return roll, pitch, yaw [rad] (..., 3), [-pi, pi), pitch in [-pi/2, pi/2], of rotation matrices (..., 3, 3)."""
     R = np.asarray(rotation, np.float64)
     pitch = np.arcsin(np.clip(-R[..., 2, 0], -1.0, 1.0))
     rpy = np.stack((np.arctan2(R[..., 2, 1], R[..., 2, 2]), pitch, np.arctan2(R[..., 1, 0], R[..., 0, 0])), -1)
@@ -133,7 +135,7 @@ def quat_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Floats:
 
 
 def rotation_vector_from_quat(quat_xyzw: ArrayLike) -> Floats:
-    """Return the logarithm: rotation vectors [rad] (..., 3), length in [0, pi], of quaternions (..., 4). Solà eq. 105."""
+    """Return rotation vectors [rad] (..., 3), length in [0, pi], of quaternions (..., 4): logarithm, Solà eq. 105."""
     quat = normalize(quat_xyzw)
     sine = np.linalg.norm(quat[..., :3], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, quat[..., 3:])

@@ -53,8 +53,8 @@ def compare_baselines(
 ) -> tuple[list[BaselineResult], list[Finding]]:
     """Return the results of every baseline, and a finding for each that cannot be fitted.
 
-    The baselines are fitted on the training samples of ``data``, centred as the model is, and evaluated on ``sets``, the same samples as
-    the predictions ``said`` of the model. ``seed`` is that of the bootstrap.
+    The baselines are fitted on the training samples of ``data``, centred like the model, and evaluated on ``sets``, the
+    samples of the model's predictions ``said``. ``seed``: of the bootstrap.
     """
     train = _select_fitted_samples(data["train"], ours)
     if not len(train):
@@ -106,7 +106,7 @@ def _fit_baselines(
 
 
 def _fit_baseline(kind: type[Predictor], train: Split, data: Dataset) -> tuple[Samples, Predictor, Prediction]:
-    """Return a fitted kind and held-out predictions of each sample; NaN if folds are too few, so that nothing is centred."""
+    """Return a fitted kind and held-out predictions of each sample; NaN if folds are too few (no centring)."""
     turn = tuple(
         feature.name for feature in available_features(read_extra_features(train)) if feature.name == "turn_radpm"
     )
@@ -139,7 +139,8 @@ def compare_with_baseline(
 ) -> Iterator[BaselineResult]:
     """Yield the results of a baseline for every quantity that it predicts.
 
-    ``ours`` and ``theirs`` are predictions for the samples of ``part``; the bootstrap with ``seed`` draws runs, or blocks of ``block_m``.
+    ``ours`` and ``theirs``: predictions for the samples of ``part``; the bootstrap with ``seed`` draws runs, or blocks
+    of ``block_m``.
     """
     drawn_by, groups = _group_samples(part.split, block_m)
     for quantity, measured in part.costs.items():

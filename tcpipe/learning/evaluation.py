@@ -1,4 +1,4 @@
-"""Evaluation as in the paper's section V for any model and dataset: tables I to III and V, with the noise floor of the labels."""
+"""Evaluation as in the paper's section V for any model and dataset: tables I to III and V, with the noise floor."""
 
 from __future__ import annotations
 
@@ -116,7 +116,8 @@ class Leakage:
         """Return how near to training a split is, in words."""
         sharing = "" if self.sharing_percent is None else f"; {self.sharing_percent:.0f} % share ground with one"
         return (
-            f"Audit (test held out by {self.holdout}): the middles of {self.near_percent:.0f} % of these samples are within "
+            f"Audit (test held out by {self.holdout}): the middles of {self.near_percent:.0f} % of these samples are "
+            "within "
             f"{self.within_m:.2f} m of a training sample's{sharing}."
         )
 

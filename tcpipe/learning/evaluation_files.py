@@ -98,7 +98,7 @@ def run_evaluation(
 ) -> EvaluationResult:
     """Evaluate a model on a dataset into the directory ``out``: new, empty, or an earlier evaluation.
 
-    It may be a URL in a bucket, where it becomes the newest build. Where the same evaluation is already, nothing is written.
+    It may be a URL in a bucket, where it becomes the newest build. An identical existing evaluation is kept.
     """
     rules = config or EvaluateConfig()
     own = [] if predictor is None else [load_own_kind(predictor).digest]

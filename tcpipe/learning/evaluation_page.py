@@ -1,4 +1,4 @@
-"""The page of an evaluation: a verdict, its samples, and its tables with those of the paper (Eder and Steinbauer-Wagner, section V)."""
+"""Page of an evaluation: verdict, samples, and tables with the paper's (Eder and Steinbauer-Wagner, section V)."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def render_evaluation_page(found: Evaluation, table: pa.Table) -> str:
     costs = "time T and energy E" if "E" in found.costs else "time T"
     paper = PageSection(
         "Comparison with the paper",
-        "The paper's tables with the figures of this model; 'tcpipe benchmark' and 'reproduce' add its other networks.\n"
-        + COUNTED,
+        "The paper's tables with the figures of this model; "
+        "'tcpipe benchmark' and 'reproduce' add its other networks.\n" + COUNTED,
         parts=[part for part in (*_make_class_sections(found), *_make_other_sections(found)) if part.rows],
     )
     audits = (f"{split}: {found.splits[split].leakage or UNKNOWN_DISTANCE}" for split in found.ordered_splits)
@@ -112,9 +112,11 @@ def _make_baselines_section(found: Evaluation) -> PageSection:
             rows.append(("", name, *cells))
     header = ("", "", *(f"{split}, {column}" for split in splits for column in ("RMSE", "ratio")))
     text = (
-        "Ratio: RMSE of the model over that of each baseline, on the same samples, with its 95 % interval; below 1 the model is better.\n"
-        "All are centred by class with the same rule, from their own held-out predictions (evaluation.json has all ratios). "
-        "Intervals: paired bootstrap over runs or blocks, ten at least. Physics and boosting also know the turn of each segment."
+        "Ratio: RMSE of the model over that of each baseline, on the same samples, with its 95 % interval; "
+        "below 1 the model is better.\n"
+        "All are centred by class with the same rule, from their own held-out predictions "
+        "(evaluation.json has all ratios). Intervals: paired bootstrap over runs or blocks, ten at least. "
+        "Physics and boosting also know the turn of each segment."
     )
     return PageSection(title, text, header=header, rows=rows)
 
@@ -143,7 +145,8 @@ def _make_coverage_section(found: Evaluation) -> PageSection:
         "that stopped it early, so that they are slightly too narrow" if is_network else "predicted by the other folds"
     )
     text = (
-        f"Intervals rest on errors on {count} samples of train {held_out}. The 95 % CI of a coverage, if there are enough runs, is "
+        f"Intervals rest on errors on {count} samples of train {held_out}. The 95 % CI of a coverage, "
+        "if there are enough runs, is "
         "binomial, clustered by run."
     )
     header = ("", "", "inside the 90 % interval", "NLL [nat]", "CRPS")
@@ -253,7 +256,8 @@ PAPER = {
     OURS: ((21.51, 10.77), (26.63, 12.80)),
     EXPECTED: ((0.22, 17.45), (0.17, 13.82)),
 }
-"""Tables III (layers that are left) to V: RMSE [J or s] and MAPE [%] of E, or of T for the expected time, on test and on unseen."""
+"""Tables III (remaining layers) to V: RMSE [J or s] and MAPE [%] of E, or of T for the expected time, on test and on
+unseen."""
 
 
 _CALLED_QUANTITY = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}
@@ -289,7 +293,10 @@ def draw_predictions(table: pa.Table, audit: str) -> PageSection:
             continue
         plot = make_plot(
             f"against {quantity}",
-            alt=f"Predicted over measured {_CALLED_QUANTITY[quantity]}, a point a sample; the tables below list the figures by class.",
+            alt=(
+                f"Predicted over measured {_CALLED_QUANTITY[quantity]}, a point a sample; "
+                "the tables below list the figures by class."
+            ),
             axes=(f"{_CALLED_QUANTITY[quantity]}, measured [{UNITS[quantity]}]", f"predicted [{UNITS[quantity]}]"),
             legend={} if plots else legend,
             height_px=380,
@@ -355,8 +362,10 @@ def make_slope_section(table: pa.Table) -> PageSection:
         return Shaded(text, rmse[cell] / most, alarm=is_doubtful)
 
     text = (
-        f"RMSE of {quantity} [{UNITS[quantity]}], in brackets the number of segments; darker is worse. * and a dashed border: "
-        f"90 % intervals cover fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them."
+        f"RMSE of {quantity} [{UNITS[quantity]}], in brackets the number of segments; darker is worse. "
+        "* and a dashed border: "
+        f"90 % intervals cover fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: "
+        "do not rely on them."
     )
     header = ["split", "class", *(_SLOPE_NAMES[at].replace(" to ", "…") for at in columns)]
     rows = [[*line, *(shade((*line, at)) for at in columns)] for line in sorted(lines)]

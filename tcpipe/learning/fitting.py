@@ -1,11 +1,11 @@
-"""How models are trained: options, and the loss of networks (the paper's equation 4).
+"""Training of models: options, and the loss of networks (the paper's equation 4).
 
 ``nrmse``
-    sqrt(((ŵ - w*) / max w*)² + ((v̂ - v*) / max v*)²): both errors without dimension, the normalised error that the paper names.
+    sqrt(((ŵ - w*) / max w*)² + ((v̂ - v*) / max v*)²): both errors without dimension, the paper's normalised error.
 ``paper_eq4``
     sqrt((ŵ - w*)² / max w* + (v̂ - v*)² / max v*): the equation as printed; power outweighs velocity about 270 : 1.
 
-Both are means over samples, with the maxima of train; the functions here take labels and predictions divided by these maxima.
+Both are means over samples, with the maxima of train; functions here take labels and predictions divided by these.
 """
 
 from __future__ import annotations
@@ -69,5 +69,5 @@ def compute_loss_factors(loss: Loss, scale: Sequence[float]) -> Floats32:
 
 
 def mean_loss(predicted: Any, labels: Any, factors: Any) -> Any:
-    """Return the loss of predictions, arrays or torch's tensors of shape (N, outputs), but for ``factors``, (outputs,)."""
+    """Return the loss of predictions, arrays or tensors (N, outputs), without the ``factors``, (outputs,)."""
     return ((((predicted - labels) ** 2 * factors).sum(1) + _SMALLEST) ** 0.5).mean()

@@ -1,14 +1,15 @@
 """The paper's two measures (section IV-A): RMSE and MAPE of power w, velocity v, time T and energy E.
 
-T̂ = d / v̂ and Ê = ŵ d / v̂ follow from what the network says (equation 5); T* and E* are measured. A percentage needs a label that is
-well above nothing: where the robot gives back or hardly takes power the MAPE leaves a sample out, and says so; the RMSE counts it.
+T̂ = d / v̂ and Ê = ŵ d / v̂ follow from the network's outputs (equation 5); T* and E* are measured. A percentage needs
+a label well above zero: the MAPE excludes samples where the robot gives back or hardly takes power, and reports it; the
+RMSE includes them.
 
-A model that states how wrong it may be (`tcpipe.cost.prediction_errors`) is scored by that, too (Gneiting and Raftery, *Strictly proper
-scoring rules, prediction, and estimation*, JASA 102, 2007): by the share of labels that its 90 % intervals hold, and, its prediction m
-taken as normal with its standard deviation s, z = (label - m) / s, by ::
+A model with uncertainties (`tcpipe.cost.prediction_errors`) is also scored by them (Gneiting and Raftery, *Strictly
+proper scoring rules, prediction, and estimation*, JASA 102, 2007): by the share of labels in its 90 % intervals, and,
+for a normal prediction of mean m and standard deviation s, z = (label - m) / s, by ::
 
     NLL  = ln(s) + z²/2 + ln(2 pi)/2                                 (their section 4.1, of the negative sign)
-    CRPS = s (z (2 Phi(z) - 1) + 2 phi(z) - 1/sqrt(pi))              (their equation 5 in closed form; in the label's unit)
+    CRPS = s (z (2 Phi(z) - 1) + 2 phi(z) - 1/sqrt(pi))            (equation 5 in closed form; in the label's unit)
 """
 
 from __future__ import annotations
@@ -167,7 +168,7 @@ PATH_M = 30
 def compute_path_error(
     predicted: Floats, measured: Floats, runs: NDArray[np.generic], start_ns: NDArray[np.generic]
 ) -> float:
-    """Return the error of sums over consecutive paths of `PATH_M` samples of a run [%]: root mean square, over the mean sum.
+    """Return the error of sums over consecutive paths of `PATH_M` samples of a run [%]: RMS over the mean sum.
 
     All arrays have shape (N,); the rest of a run counts as a path if it is its only one.
     """
@@ -196,7 +197,7 @@ FEWEST_GROUPS = 10
 
 @dataclass(frozen=True, slots=True)
 class Ratio:
-    """A ratio of errors with its 95 % interval; None where there is nothing to divide by, or there are too few groups."""
+    """Ratio of errors with its 95 % interval; None if the divisor is zero, or there are too few groups."""
 
     value: float | None
     low: float | None
@@ -212,10 +213,11 @@ class Ratio:
 def compare_errors(ours: Floats, theirs: Floats, groups: NDArray[np.generic], *, seed: int) -> Ratio:
     """Return the ratio of two RMSE over the same samples with its interval.
 
-    Groups are drawn anew with all of their samples, the same ones for both sides. Quantiles of the logarithm are widened by as much as
-    Student's t is wider than the normal, and for the share of the scatter that the mean takes up: of few groups plain quantiles are too
-    sure of themselves (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 13). Where groups differ much, such an interval
-    holds the truth in 92 of 100 cases (tested); a studentised one does no better, and is at times many times as wide.
+    Groups are drawn anew with all of their samples, the same ones for both sides. Quantiles of the logarithm are
+    widened by the ratio of Student's t to the normal, and for the share of the scatter that the mean takes up: with few
+    groups plain quantiles are overconfident (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 13). If
+    groups differ much, such an interval contains the truth in 92 of 100 cases (tested); a studentised one does no
+    better, and is at times many times as wide.
 
     Parameters
     ----------

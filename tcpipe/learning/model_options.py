@@ -26,7 +26,8 @@ class TrainOptions:
     model: Literal["auto", "linear", "physics", "boosting", "resnet18"] | None = option(
         None,
         "Curves of class and slope, physics, a curve and boosted trees on what it leaves, or the paper's network. "
-        "auto: the simplest that predicts other runs as well as the best (default; with an option of the network, resnet18).",
+        "auto: the simplest that predicts other runs as well as the best (default; "
+        "with an option of the network, resnet18).",
         kind=("auto", "linear", "physics", "boosting", "resnet18"),
     )
     predictor: str | None = option(None, PREDICTOR)
@@ -59,7 +60,8 @@ class TrainOptions:
     )
     layers: str | Sequence[str] | None = option(
         None,
-        "Layers of the patch, with commas between them, own ones by their names; NAME_one_hot has a channel for each class "
+        "Layers of the patch, with commas between them, own ones by their names; "
+        "NAME_one_hot has a channel for each class "
         "(default: ortho, terrain and height, as far as the dataset has them).",
         metavar="NAME,NAME,…",
     )

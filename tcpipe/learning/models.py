@@ -4,7 +4,7 @@
 
     model.json         inputs, outputs, training range and training; checksums of the other files
     weights.npz        the weights of a network by torch's names; curves and trees; coefficients of physics
-    residuals.parquet  labels and predictions of the fold that stopped a network; else of all samples, by the other folds
+    residuals.parquet  labels and predictions of the fold that stopped a network; else of all samples, by other folds
     ground.parquet     longitude and latitude of the training samples; empty without coordinates
     history.csv        losses of every epoch
 """
@@ -104,7 +104,7 @@ class Model:
         return estimate_correlation(self.residuals)
 
     def ask(self, patches: Floats32, features: ExtraFeatures | None = None) -> Prediction:
-        """Return the predictions of patches in [0, 1], shape (N, px, px, depth), and the covariances that the predictor states.
+        """Return predictions of patches in [0, 1], shape (N, px, px, depth), and the predictor's own covariances.
 
         A model of time alone gives power and velocity, too: its power is NaN.
         ``features`` are those of the N segments (`tcpipe.dataset.extra_features.read_extra_features` of a split).
@@ -206,7 +206,7 @@ def choose_model(path: Location, *, speed_mps: float | None = None, predictor: s
 
 
 def set_speed(model: Model, speed_mps: float) -> Model:
-    """Return the model asked for a commanded speed [m/s] instead of the usual one; `UsageError` if it knows no such speed."""
+    """Return the model for a commanded speed [m/s] instead of the usual one; `UsageError` for an untrained speed."""
     command = next((feature for feature in model.card.inputs.extra_features if feature.name == "command_mps"), None)
     if command is None:
         raise UsageError(
@@ -215,7 +215,8 @@ def set_speed(model: Model, speed_mps: float) -> Model:
     low, high = command.training_range
     if not low - _SPEED_MARGIN_MPS <= speed_mps <= high + _SPEED_MARGIN_MPS:
         raise UsageError(
-            f"--speed {speed_mps:g}: {model.name} was trained at commanded speeds of {low:.3g} to {high:.3g} m/s; give one of these"
+            f"--speed {speed_mps:g}: {model.name} was trained at commanded speeds of {low:.3g} to {high:.3g} m/s; "
+            "give one of these"
         )
     extra_features = tuple(
         replace(feature, usual=speed_mps) if feature is command else feature

@@ -1,9 +1,9 @@
-"""The paper's network (section III-D) and its training step, in plain torch: ResNet-18 with a head of two outputs, and Adam.
+"""The paper's network (section III-D) and its training step in plain torch: ResNet-18 with two outputs, and Adam.
 
-Import it only where a network is created. He et al., Deep Residual Learning for Image Recognition, 2016, table 1: a 7 × 7 convolution and
-a pooling, both with stride 2, then two basic blocks each of 64, 128, 256 and 512 filters. The paper used Keras: strides of two are padded
-as TensorFlow's "same" does, where the last of an odd number of padding pixels comes after the image; initial weights and the constants of
-batch normalisation are those of Keras.
+Import it only where a network is created. He et al., Deep Residual Learning for Image Recognition, 2016, table 1: a 7 ×
+7 convolution and a pooling, both with stride 2, then two basic blocks each of 64, 128, 256 and 512 filters. The paper
+used Keras: strides of two are padded as TensorFlow's "same" does, with the last of an odd number of padding pixels
+after the image; initial weights and the constants of batch normalisation are those of Keras.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class BasicBlock(nn.Module):
 
 
 class ResNet18(nn.Module):
-    """Patches, float32 (N, depth, px, px), to outputs, (N, outputs); ``width`` filters in the first stage, 64 of ResNet-18."""
+    """Patches, float32 (N, depth, px, px), to outputs, (N, outputs); ``width``: filters of the first stage (64)."""
 
     def __init__(self, depth: int, outputs: int, width: int) -> None:
         super().__init__()
@@ -103,7 +103,7 @@ class ResNet18(nn.Module):
 
     @classmethod
     def from_arrays(cls, depth: int, outputs: int, width: int, *, arrays: Arrays) -> ResNet18:
-        """Return a network of these sizes with its weights; `ModelError`, before memory is allocated, if the weights have other sizes."""
+        """Return a network with its weights; `ModelError` for weights of other sizes, before memory is allocated."""
         with torch.device("meta"):
             network = cls(depth, outputs, width)
         network.load(arrays)
@@ -124,7 +124,7 @@ class ResNet18(nn.Module):
 
 
 def make_resnet18(depth: int, outputs: int, width: int, *, seed: int, start: Sequence[float]) -> ResNet18:
-    """Return the untrained network on the device that there is; ``start`` is what it predicts on average: the head's biases."""
+    """Return the untrained network on the available device; ``start``: mean predictions, as biases of the head."""
     network, drawn = ResNet18(depth, outputs, width), torch.Generator().manual_seed(seed)
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d):

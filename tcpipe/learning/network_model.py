@@ -1,4 +1,4 @@
-"""The paper's network as a model: fitted in epochs, stopped by a fold of train; a checkpoint lets a killed training continue unchanged."""
+"""The paper's network as a model, stopped by a fold of train; a checkpoint resumes an interrupted training exactly."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ Arrays = Mapping[str, NDArray[np.generic]]
 logger = logging.getLogger("tcpipe")
 
 BLOCK, _MOST_WIDTH, _MOST_INPUTS = 16, 512, 1024
-"""Channels that CPU convolutions hold together: of fewer, oneDNN, by which PyTorch convolves there, writes beyond its memory in the
-gradient of a 1 × 1 convolution with a stride (its issue 6035); seen to crash with 4 and 8 filters."""
+"""Channels combined by CPU convolutions: with fewer, oneDNN, which PyTorch uses there, writes beyond its memory in the
+gradient of a 1 × 1 convolution with a stride (its issue 6035); it crashed with 4 and 8 filters."""
 
 _SLOWER = 0.1
 """Factor of the learning rate when the loss stops falling."""
@@ -143,8 +143,8 @@ class NetworkModel(Predictor):
     def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
         """Train until the loss of the held-out fold stops falling, and return the network with the smallest.
 
-        ``job.checkpoint``, from which training continues, is the state at the end of an epoch. It is written before the first epoch, when
-        training is interrupted, and every `_SECONDS_BETWEEN`.
+        ``job.checkpoint``, from which training continues, is the state at the end of an epoch. It is written before the
+        first epoch, on interruption, and every `_SECONDS_BETWEEN`.
         """
         is_held = samples.folds == samples.config.fold
         fit, held = samples.take(~is_held), samples.take(is_held)
@@ -226,10 +226,10 @@ def _make_trainer(fit: Samples) -> tuple[Trainer, str]:
 
 
 def compute_learning_rate(config: FitConfig, progress: TrainingProgress) -> float:
-    """Return the rate of the next epoch: a tenth each time that half the patience brings nothing better, and a tenth of that at the end.
+    """Return the next epoch's rate: a tenth after half the patience without progress; in the last, a tenth of that.
 
-    Steps of one length end beside the minimum, and the moving means of the batch normalisation behind the weights: predictions of
-    either are off on average.
+    Constant steps end beside the minimum, and the moving means of the batch normalisation behind the weights:
+    predictions of either have a bias.
     """
     rate, best, waited = config.learning_rate, float("inf"), 0
     for _, _, held in progress.history:

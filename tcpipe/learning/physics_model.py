@@ -1,7 +1,7 @@
-"""Models of few coefficients: curves over the slope for each terrain class, and the physics of power (`tcpipe.cost.physics`).
+"""Models of few coefficients: curves over slope by terrain class, and the physics of power (`tcpipe.cost.physics`).
 
-A curve is a polyline over the slope, fitted by least squares. The curve of a class with few samples stays near that of all ground: the
-difference between them is penalised as if as many samples as a curve has coefficients had shown none.
+A curve is a polyline over the slope, fitted by least squares. The curve of a class with few samples stays near that of
+all ground: its difference is penalised like J samples without one, J being a curve's number of coefficients.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def fit_physics_model(extra_features: ExtraFeatures, labels: Floats, *, idle_wat
 
 
 def compute_idle_power(split: Split) -> float | None:
-    """Return what the robot draws while it stands, of the power that a split's labels are of [W]; None where no run of it stood."""
+    """Return the idle power contained in a split's power labels [W]; None if no run of it was stationary."""
     if split.energy is not ENERGIES["total"]:
         return 0.0
     watt = split.column("idle_power_watt").astype(np.float64)
@@ -134,7 +134,7 @@ def _evaluate_all(found: Physics, term: str) -> Floats:
 
 
 def _collect_by_class(found: Physics, term: str) -> Floats:
-    """Return a coefficient by class id, shape (256,); a class that the fit does not name has that of the others, or their mean."""
+    """Return a coefficient by class id, shape (256,); missing classes have that of all ground, or the mean."""
     own = {name: found.value[at] for at, (kind, name) in enumerate(found.terms) if kind == term}
     rest = own.get(ALL, np.mean(list(own.values())) if own else 0.0)
     return np.array([own.get(str(class_id), rest) for class_id in range(_CLASSES)])
@@ -266,7 +266,7 @@ def cross_fit_curves(slope_rad: Floats, class_id: Ints, labels: Floats, folds: N
 
 
 def _evaluate_functions(knots_rad: Floats, slope_rad: Floats) -> Floats:
-    """Return the functions of a curve at these slopes, shape (N, J), all of order one so that none is lost by rounding."""
+    """Return a curve's basis functions at these slopes, shape (N, J), scaled to order one against rounding."""
     one = np.ones_like(slope_rad)
     if not knots_rad.size:
         return one[:, None]

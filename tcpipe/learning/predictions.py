@@ -91,8 +91,8 @@ class Predicted:
 def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)) -> Predicted:
     """Return the predicted w, v, T, E of every sample; v and T of a model of time alone.
 
-    It is centred by class, or as one where it is not shown the classes. Channels that ``noise`` names are replaced by noise of this seed,
-    uniform in [0, 1], each pixel on its own (section V-C).
+    It is centred by class, or in total for a model without classes. Channels in ``noise`` are replaced by noise of this
+    seed, uniform in [0, 1], independent by pixel (section V-C).
     """
     rng, layout = np.random.default_rng(list(seed)), model.card.layout
     replaced = [place for place, plane in enumerate(layout.planes) if plane.partition("[")[0] in noise]
@@ -110,7 +110,7 @@ def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed
 
 
 def predict_spreads(model: Model, said: Predicted, found: Measured) -> dict[str, Spread]:
-    """Return what is known of the errors of a model's costs, by quantity; nothing if it has too few held-out samples."""
+    """Return the error models of a model's costs, by quantity; none if it has too few held-out samples."""
     if model.errors is None:
         return {}
     is_near = None
@@ -226,7 +226,7 @@ def compute_cost_errors(table: pa.Table, quantity: str) -> Floats:
 
 
 def find_worst_rows(table: pa.Table, count: int) -> Ints:
-    """Return the rows of the ``count`` samples of each split with the largest errors of the main cost, largest first, split by split."""
+    """Return the ``count`` rows of each split with the largest errors of the main cost, largest first, by split."""
     off, split = np.abs(compute_cost_errors(table, find_main_cost(table))), to_texts(table.column("split"))
     found = [np.empty(0, np.int64)]
     for name in dict.fromkeys(split.tolist()):

@@ -1,20 +1,21 @@
 """Protocol of a model of the cost of a metre, and the kinds of models.
 
-The kinds that tcpipe ships implement `Predictor` and nothing else, so that a model of your own can do all that they can. A kind is a
-class; only ``predict`` is needed, ``fit`` to be trained, and ``to_arrays`` with ``from_arrays`` to be kept in a model folder::
+The kinds in tcpipe implement `Predictor` and nothing else, so that your own model has the same abilities. A kind is a
+class; only ``predict`` is needed, ``fit`` for training, and ``to_arrays`` with ``from_arrays`` for a model folder::
 
     class MeanOfClass:
         @classmethod
         def fit(cls, samples): ...                     # Samples: patches, features, labels, folds
-        def predict(self, patches, features): ...      # power [W] and velocity [m/s], shape (N, 2), or (these, covariances (N, 2, 2))
+        def predict(self, patches, features): ...  # power [W], velocity [m/s], (N, 2), or with covariances (N, 2, 2)
         def to_arrays(self): ...                       # dict of numpy arrays
         @classmethod
         def from_arrays(cls, arrays, inputs): ...      # Inputs: channels, size of a patch, classes
 
-``patches`` are float32 (N, px, px, channels) in [0, 1], travel to the right; ``features`` (`tcpipe.dataset.extra_features.ExtraFeatures`)
-has slope, terrain class, turn and commanded speed of each. Intervals come from predictions of samples that a model was not fitted to:
-``fit`` is called for the other folds of each fold, unless the class has ``fit_folds``, and for the other runs of each fifth of the runs.
-Their errors are the covariance of a model that states none, and scale that of one that does (`tcpipe.cost.prediction_errors`).
+``patches`` are float32 (N, px, px, channels) in [0, 1], travel to the right; ``features``
+(`tcpipe.dataset.extra_features.ExtraFeatures`) has slope, terrain class, turn and commanded speed of each. Intervals
+come from predictions of samples that a model was not fitted to: ``fit`` is called without each fold, unless the class
+has ``fit_folds``, and without each fifth of the runs. Their errors are the covariance of a model that returns none, and
+scale that of one that does (`tcpipe.cost.prediction_errors`).
 """
 
 from __future__ import annotations
@@ -178,7 +179,8 @@ class Predictor(Protocol):
     def predict(self, patches: Patches, features: ExtraFeatures) -> Labels | tuple[Labels, Labels]:
         """Return outputs of N metres of ground, shape (N, outputs): power [W] and velocity [m/s].
 
-        Or these and the covariances of their errors, shape (N, outputs, outputs), in squares and products of these units.
+        Or these and the covariances of their errors, shape (N, outputs, outputs), in squares and products of these
+        units.
         """
 
     @classmethod
@@ -289,7 +291,8 @@ def ask_predictor(
     wrong |= ~np.isclose(covariance, transposed, rtol=1e-4, atol=0.0).all(axis=(1, 2))
     if wrong.any():
         raise ModelError(
-            f"{who} returned {int(wrong.sum())} of {len(mean)} covariances that are none: expected finite symmetric matrices "
+            f"{who} returned {int(wrong.sum())} of {len(mean)} covariances that are none: "
+            "expected finite symmetric matrices "
             "without negative eigenvalues"
         )
     return Prediction(mean, covariance)

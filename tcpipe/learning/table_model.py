@@ -1,17 +1,18 @@
-"""A table model: curves over slope and class, and boosted trees over features of a patch for the residuals of these curves.
+"""A table model: curves over slope and class, and boosted trees over patch features for the curves' residuals.
 
-Trees alone are constant outside the training range, and coarse with few samples; the curves continue as straight lines. LightGBM (extra
-``tables``) grows the trees; predicting needs only their arrays. The features come from the tensor alone:
+Trees are constant outside the training range, and coarse with few samples; the curves continue as straight lines.
+LightGBM (extra ``tables``) grows the trees; predicting needs only their arrays. The features come from the tensor
+alone:
 
-======== ==================================================================================================================
+======== ==============================================================================================================
 channel  features
-======== ==================================================================================================================
-height   slope along travel and steepness across it [rad], curvature along and across [1/m] of the best paraboloid, standard
-         deviation of the ground from it (roughness) and highest minus lowest pixel (relief) [m]
+======== ==============================================================================================================
+height   slope along travel and steepness across it [rad], curvature along and across [1/m] of the best paraboloid,
+         standard deviation from it (roughness) and highest minus lowest pixel (relief) [m]
 terrain  share of the patch that each class has
 band     mean and standard deviation of each band of a layer of several
 others   mean, standard deviation (contrast), mean difference of neighbours along travel (texture)
-======== ==================================================================================================================
+======== ==============================================================================================================
 
 Mirroring a patch across its travel changes none of them. A pixel without data counts as 0, as in the tensor.
 """
@@ -69,7 +70,7 @@ def compute_patch_features(patches: Patches, *, channels: Sequence[str], class_c
 
 
 def find_slope_and_class(features: Floats, channels: Sequence[str], class_count: int) -> tuple[Floats, Ints]:
-    """Return slope [rad] and most frequent class of patches by their features, shape (N,) each; 0 without heights, or classes."""
+    """Return slope [rad] and most frequent class of patches by features, (N,) each; 0 without heights or classes."""
     slope, class_id = np.zeros(len(features)), np.zeros(len(features), np.int64)
     for channel, at in _locate_features(channels, class_count):
         if channel == "height":
@@ -114,19 +115,21 @@ def _compute_class_shares(values: Patches, class_count: int) -> Floats:
 def make_rules(config: TrainConfig) -> dict[str, str | float | bool]:
     """Return the settings of LightGBM: the same bytes on any number of cores; nothing random."""
     return {
-        "objective": "regression", "metric": "l2", "learning_rate": config.tree_learning_rate, "num_leaves": config.tree_leaves,
-        "max_depth": config.tree_depth, "min_data_in_leaf": config.leaf_samples, "lambda_l2": 1.0, "use_missing": False,
+        "objective": "regression", "metric": "l2", "learning_rate": config.tree_learning_rate,
+        "num_leaves": config.tree_leaves, "max_depth": config.tree_depth,
+        "min_data_in_leaf": config.leaf_samples, "lambda_l2": 1.0, "use_missing": False,
         "num_threads": 1, "deterministic": True, "force_col_wise": True, "verbosity": -1,
     }  # fmt: skip
 
 
 _HEADER = (
-    "tree\nversion=v4\nnum_class=1\nnum_tree_per_iteration=1\nlabel_index=0\nmax_feature_idx={last}\nobjective=regression\n"
-    "feature_names={names}\nfeature_infos={infos}\n\n"
+    "tree\nversion=v4\nnum_class=1\nnum_tree_per_iteration=1\nlabel_index=0\nmax_feature_idx={last}\n"
+    "objective=regression\nfeature_names={names}\nfeature_infos={infos}\n\n"
 )
 _TREE = re.compile(
-    r"Tree=\d+\nnum_leaves=(\d+)\nnum_cat=0\nsplit_feature=([\d ]*)\n(?:split_gain=.*\n)?threshold=(.*)\ndecision_type=([2 ]*)\n"
-    r"left_child=([\d -]*)\nright_child=([\d -]*)\nleaf_value=(.*)\n(?:(?:leaf|internal)_.*\n)*is_linear=0\nshrinkage=.*\n+",
+    r"Tree=\d+\nnum_leaves=(\d+)\nnum_cat=0\nsplit_feature=([\d ]*)\n(?:split_gain=.*\n)?threshold=(.*)\n"
+    r"decision_type=([2 ]*)\nleft_child=([\d -]*)\nright_child=([\d -]*)\n"
+    r"leaf_value=(.*)\n(?:(?:leaf|internal)_.*\n)*is_linear=0\nshrinkage=.*\n+",
     re.ASCII,
 )
 _WRITTEN = (
@@ -137,7 +140,7 @@ _END = "end of trees\n"
 
 
 def clean_trees(text: str, features: int) -> str:
-    """Return a text model of LightGBM with only what predictions need; `ModelError` where its reader would follow a wrong index."""
+    """Return a LightGBM text model with only what predictions need; `ModelError` for an invalid index."""
     body = text[text.find("Tree=") : text.rfind(_END)]
     found, parts = list(_TREE.finditer(body)), list[str]()
     if not found or sum(len(match[0]) for match in found) != len(body):

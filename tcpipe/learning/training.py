@@ -78,7 +78,8 @@ class TrainResult:
         best = f", best {self.best_epoch} of {self.epochs} epochs or trees" if self.epochs > 1 else ""
         return (
             f"{self.path}: {self.model} of {self.samples['fitted']} samples{best}\n"
-            f"loss {self.held_out_loss:.4f} of {self.samples['held out']} held-out samples; {times.total_s:.1f} s on {self.device}"
+            f"loss {self.held_out_loss:.4f} of {self.samples['held out']} held-out samples; "
+            f"{times.total_s:.1f} s on {self.device}"
         )
 
 
@@ -87,10 +88,10 @@ _PARTS = 5
 
 
 def choose_kind(data: Dataset, config: FitConfig, split: Split | None = None) -> ModelKind:
-    """Return the simplest kind that predicts other runs as well as the best one, within a standard error of the difference.
+    """Return the simplest kind within one standard error of the best at predicting other runs.
 
-    Each part of the runs is predicted by models of the others; of a single run, each fold. The loss is the squared error of time and of
-    energy, each over its variance. ``split`` are labelled samples of train, by default all.
+    Each part of the runs is predicted by models of the rest; of a single run, each fold. The loss is the squared error
+    of time and of energy, each over its variance. ``split``: labelled samples of train, by default all.
     """
     split = select_train(data, config) if split is None else split
     runs, folds = (np.unique(split.column(name), return_inverse=True)[1] for name in ("run_id", "fold"))
@@ -108,7 +109,8 @@ def choose_kind(data: Dataset, config: FitConfig, split: Split | None = None) ->
     chosen = next(name for name, loss in losses.items() if is_within_error(loss - losses[best], clusters))
     figures = ", ".join(f"{name} {loss.mean() / 2.0:.3f}" for name, loss in losses.items())
     logger.info(
-        "%s: chooses %s, the simplest within one standard error of the best (%s). Unexplained share of the variance of T and E, "
+        "%s: chooses %s, the simplest within one standard error of the best (%s). "
+        "Unexplained share of the variance of T and E, "
         "predicted by other runs: %s. To choose another: --model", data.path, chosen, best, figures,
     )  # fmt: skip
     return chosen
@@ -146,9 +148,9 @@ def train(
     Parameters
     ----------
     dataset : what ``tcpipe build-dataset`` wrote.
-    out : a new folder, or one with only a model, which is replaced unless it is complete and of the same dataset and options; or a URL in a
-        bucket, where it becomes the newest build. ``<out>.KEY.checkpoint`` beside the folder, or in this one for a URL, keeps the state,
-        so that a training resumes; another dataset, or other options, have another one.
+    out : a new folder, or one with only a model, which is replaced unless it is complete and of the same dataset and
+        options; or a URL in a bucket, where it becomes the newest build. ``<out>.KEY.checkpoint`` beside the folder, or
+        in this one for a URL, keeps the state, so that a training resumes; KEY depends on dataset and options.
     config : the options.
     no_resume : ignore an earlier state.
     predictor : code of the user, ``FILE.py[:NAME]``, that is fitted instead of a shipped kind.
@@ -159,7 +161,8 @@ def train(
     data = open_dataset(dataset, label=rules.label)
     if not data.card.layers:
         raise DatasetError(
-            f"{data.path}: has no patches, which a model is trained on; build it with a map (tcpipe add-map) and without "
+            f"{data.path}: has no patches, which a model is trained on; "
+            "build it with a map (tcpipe add-map) and without "
             "--without-patches, or train your own model on its samples.parquet"
         )
     key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules)})
@@ -238,7 +241,7 @@ def select_train(data: Dataset, rules: FitConfig, kind: type[Predictor] = Predic
 def make_training_samples(
     data: Dataset, rules: FitConfig, kind: type[Predictor], train: Split | None = None
 ) -> Samples:
-    """Return the samples of a kind of model: labelled samples ``train``, or all that `select_train` finds, which need folds."""
+    """Return the samples of a kind of model: labelled ``train``, or those of `select_train`, which need folds."""
     needs_folds = train is None
     if train is None:
         train = select_train(data, rules, kind)
@@ -252,7 +255,8 @@ def make_training_samples(
         if data.card.recipe.split.holdout in ("run", "tag"):
             cure = "they are of whole runs: drive once more, or build it with --holdout block"
         raise DatasetError(
-            f"{data.path}: fold {rules.fold} of train leaves {len(fitted)} samples to fit and {len(train) - len(fitted)} held out; "
+            f"{data.path}: fold {rules.fold} of train leaves {len(fitted)} samples to fit and "
+            f"{len(train) - len(fitted)} held out; "
             f"expected both (there are folds {', '.join(map(str, np.unique(folds)))}; {cure})"
         )
     used = fitted if kind.stops_by_fold else train
@@ -274,7 +278,8 @@ def _find_extra_features(used: Split, wanted: Sequence[str] | None, data: Datase
     lacking = [_CALLED[name] for name in names if name not in {feature.name for feature in found}]
     if lacking and not found and wanted is None:
         raise DatasetError(
-            f"{data.path}: its samples have no {' and no '.join(lacking)}; ingest the logs again and build the dataset again, "
+            f"{data.path}: its samples have no {' and no '.join(lacking)}; ingest the logs again and build the dataset "
+            "again, "
             "or train without --extra-features"
         )
     if lacking:
@@ -329,14 +334,16 @@ def _reject_other_files(out: Location) -> None:
     strangers = sorted(name for name in entries - set(FILES) if not name.startswith("."))
     if strangers:
         raise UsageError(
-            f"{place}: contains {', '.join(strangers)} in the directory of a model, which would be replaced; move it, or give another OUT"
+            f"{place}: contains {', '.join(strangers)} in the directory of a model, which would be replaced; "
+            "move it, or give another OUT"
         )
 
 
 def _make_result(place: Location, status: str, training: Training, times: TrainingTimes) -> TrainResult:
     return TrainResult(
         path=str(place), status=status, model=training.kind, samples=training.samples, epochs=training.epochs,
-        best_epoch=training.best_epoch, held_out_loss=training.held_out_loss, device=training.device, training_times_s=times,
+        best_epoch=training.best_epoch, held_out_loss=training.held_out_loss,
+        device=training.device, training_times_s=times,
     )  # fmt: skip
 
 
@@ -379,7 +386,7 @@ def read_class_table(card: DatasetCard) -> ClassTable:
 
 
 def _find_middles(split: Split) -> Floats:
-    """Return longitude and latitude of the middle of each sample [deg], shape (N, 2); none of a dataset without coordinates."""
+    """Return longitude, latitude of each sample's middle [deg], shape (N, 2); none without coordinates."""
     return compute_middles([split.column(name) for name in PLACES]) if split.has_coordinates else np.empty((0, 2))
 
 

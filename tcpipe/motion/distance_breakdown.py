@@ -1,10 +1,10 @@
 """Distance breakdown of a track: the spans that are kept, and the reason of each interval that is masked.
 
-The odometer is the horizontal length of the estimated track: Hermite arcs inside its sections, straight lines across its gaps. A jump of
-the estimate is no driving: such a step counts by its speed. Each interval between two rows belongs to one entry, so their sum is the
-odometer (docs/explanation/rulings.md, Marked, not deleted).
+The odometer is the horizontal length of the estimated track: Hermite arcs inside its sections, straight lines across
+its gaps. A jump of the estimate is no driving: such a step counts by its speed. Each interval between two rows belongs
+to one entry, so their sum is the odometer (docs/explanation/rulings.md, Marked, not deleted).
 
-The catalogue of findings says how to avoid each large loss (``lost-...``).
+The catalogue of findings states how to avoid each large loss (``lost-...``).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ JUMP_M = 1.0
 
 
 def compute_unexplained_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats, piece: Ints) -> Floats:
-    """Return how far each interval's step lies horizontally off what the velocity explains, [m], shape (N - 1,); 0 across holes.
+    """Return how far each step is horizontally from the velocity's, [m], shape (N - 1,); 0 across gaps.
 
     Parameters are `compute_interval_length_m`'s.
     """
@@ -71,12 +71,12 @@ def compute_interval_length_m(stamp_ns: Ints, position_m: Floats, velocity_mps: 
 
 
 def compute_interval_duration_s(stamp_ns: Ints, epoch: Ints) -> Floats:
-    """Return the duration of every interval between rows, [s], shape (N - 1,); 0 across a clock epoch, whose step is no time."""
+    """Return the duration of every interval between rows, [s], shape (N - 1,); 0 between clock epochs."""
     return np.where(np.diff(epoch) == 0, np.diff(stamp_ns) * 1e-9, 0.0)
 
 
 def sum_by_reason(reason: NDArray[np.uint32], amount: Floats) -> dict[str, float]:
-    """Return the sum of an amount an interval (metres, seconds, joules) by reason's name, every `DropReason` present."""
+    """Return sums of an amount an interval (metres, seconds, joules) by name of every `DropReason` present."""
     return {flag_name(bit): float(amount[reason == int(bit)].sum()) for bit in DropReason}
 
 
@@ -92,7 +92,7 @@ def make_loss_code(reason: str) -> str:
 
 
 def find_losses(breakdown_m: Mapping[str, float], subject: Subject) -> list[Finding]:
-    """Return the findings on losses of more than a twentieth of the distance [m], the largest first; none of a robot that did not move."""
+    """Return findings on losses of over a twentieth of the distance [m], the largest first; none without motion."""
     total_m = sum(breakdown_m.values())
     if total_m < read_threshold("no-segments", "min_driven_m"):
         return []

@@ -1,7 +1,7 @@
-"""Which rows of a track are not steady driving, each kind by its own pure function.
+"""Masks of the rows of a track that are not steady driving, one pure function for each reason.
 
-The rulings behind them: docs/explanation/rulings.md, Acceleration, At the limit, In-place rotation. Every function returns a mask of rows,
-shape (N,). A slowdown that the terrain causes is the signal: where commands are known, no function here marks it.
+Rulings: docs/explanation/rulings.md, Acceleration, At the limit, In-place rotation. Every function returns a mask of
+rows, shape (N,). A slowdown by terrain is the signal: with known commands, no function here marks it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tcpipe.motion.row_sections import (
 
 
 def find_stuck(rows: MotionRows, *, stationary_velocity_mps: float, wheel_velocity_above_mps: float) -> Mask:
-    """Return rows where the wheels turn but the ground speed is that of standing; never where the wheels are unknown."""
+    """Return rows where the wheels turn at a stationary ground speed; none where the wheel speed is unknown."""
     turning_wheels = np.abs(np.nan_to_num(rows.wheel_velocity_mps)) > wheel_velocity_above_mps
     return turning_wheels & (np.abs(rows.velocity_mps) < stationary_velocity_mps)
 
@@ -30,7 +30,8 @@ def find_stuck(rows: MotionRows, *, stationary_velocity_mps: float, wheel_veloci
 def find_stationary(rows: MotionRows, *, below_velocity_mps: float, below_yaw_rate_radps: float) -> Mask:
     """Return rows that move less than both limits, and the slower row of a change of direction that skips them.
 
-    At 20 Hz a quick change between forward and backward may jump over the band around zero; the robot stood for an instant all the same.
+    At 20 Hz a quick change between forward and backward may skip the band around zero; the robot is stationary for an
+    instant all the same.
     """
     v, piece = rows.velocity_mps, rows.piece
     still = (np.abs(v) < below_velocity_mps) & (np.abs(rows.yaw_rate_radps) < below_yaw_rate_radps)
@@ -43,7 +44,7 @@ def find_stationary(rows: MotionRows, *, below_velocity_mps: float, below_yaw_ra
 def find_turning_in_place(
     rows: MotionRows, *, below_velocity_mps: float, above_yaw_rate_radps: float, min_radius_m: float, min_s: float
 ) -> Mask:
-    """Return rows that turn on the spot for at least ``min_s`` [s], or turn tighter than ``min_radius_m`` at any speed."""
+    """Return rows that turn in place for at least ``min_s`` [s], or turn tighter than ``min_radius_m`` at any speed."""
     speed, turn = np.abs(rows.velocity_mps), np.abs(rows.yaw_rate_radps)
     spot = (speed < below_velocity_mps) & (turn > above_yaw_rate_radps)
     return drop_short_runs(spot, rows.piece, min_rows=rows.count(min_s)) | (speed < min_radius_m * turn)
@@ -71,9 +72,9 @@ def find_accelerating(
 def find_ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, above_mps2: float, min_s: float) -> Mask:
     """Return the rows beside halted ones over which the speed still grows after, or already falls before, the halt.
 
-    A ramp ends where the speed changes by less than ``above_mps2`` for ``min_s`` [s]. It is marked with and without commands: a robot
-    whose commands simply end (dead man's switch, emergency stop) coasts to a halt while its last command stands. ``halted`` rows are
-    stationary or turn in place.
+    A ramp ends when the speed changes by less than ``above_mps2`` for ``min_s`` [s]. It is marked with and without
+    commands: a robot whose commands end (dead man's switch, emergency stop) coasts to a halt while its last command
+    persists. ``halted`` rows are stationary or turn in place.
     """
     speeding_up = np.sign(rows.velocity_mps) * acceleration_mps2
     halts = np.concatenate(([0], np.cumsum(halted)))
@@ -86,11 +87,11 @@ def find_ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, abo
 
 
 def find_command_changes(rows: MotionRows, *, step_mps: float, window_s: float, settle_s: float) -> Mask:
-    """Return rows from the first to the last moment of each commanded change of speed, and for ``settle_s`` [s] after it.
+    """Return rows from the start to the end of each commanded change of speed, and for ``settle_s`` [s] after it.
 
-    The mean command over the window ahead of a row is compared with the mean over the window from it on: a step or a ramp of more than
-    ``step_mps`` within one window shows at full size. The jitter of a joystick averages out; twice what its scatter leaves in the
-    difference of both means is allowed for.
+    The mean command over the window before a row is compared with that over the window from it on: a step or a ramp of
+    more than ``step_mps`` within one window shows at full size. The jitter of a joystick averages out; the limit is
+    raised by twice its remainder in the difference of both means.
     """
     part, command = _select_known_command(rows)
     window = max(1, rows.count(window_s))
@@ -109,7 +110,7 @@ def find_command_changes(rows: MotionRows, *, step_mps: float, window_s: float, 
 
 
 def _estimate_jitter(command: Floats, part: Ints, window: int) -> Floats:
-    """Return what row-to-row scatter leaves in the difference of the means after and before each row, [m/s], shape (N,)."""
+    """Return the row-to-row scatter in the difference of the means after and before each row, [m/s], shape (N,)."""
     square = np.concatenate((np.zeros(min(len(command), 1)), 0.5 * np.diff(command) ** 2))
     scatter = np.fmax(
         np.nan_to_num(compute_window_mean(square, part, before=window - 1, after=-1)),
@@ -122,7 +123,7 @@ def _estimate_jitter(command: Floats, part: Ints, window: int) -> Floats:
 
 
 def _find_moment(command: Floats, before_mps: float, after_mps: float, *, step_mps: float) -> tuple[int, int]:
-    """Return, among the rows that see a change, the first that has left the old value and the first that stays at the new one."""
+    """Return the first row that leaves the old value, and the first that stays at the new one, in a change."""
     left = np.flatnonzero(np.abs(command - before_mps) > step_mps)
     unreached = np.flatnonzero(np.abs(command - after_mps) > step_mps)
     begin = int(left[0]) if len(left) else 0
@@ -130,7 +131,7 @@ def _find_moment(command: Floats, before_mps: float, after_mps: float, *, step_m
 
 
 def find_below_full_speed(rows: MotionRows, *, limit_mps: float, window_s: float) -> Mask:
-    """Return rows commanded slower than the limit, by their own command and by the mean around them (a joystick jitters)."""
+    """Return rows commanded slower than the limit, by their own and the surrounding mean command (joystick jitter)."""
     part, command = _select_known_command(rows)
     speed = np.abs(command)
     half = rows.count(window_s / 2)
@@ -141,9 +142,10 @@ def find_below_full_speed(rows: MotionRows, *, limit_mps: float, window_s: float
 def find_top_command(
     rows: MotionRows, *, moving_above_mps: float, share_of_top: float, window_s: float
 ) -> tuple[float, float]:
-    """Return the speed [m/s] that a moving run was commanded at most (but for a hundredth of the time), and the share of it held there.
+    """Return a moving run's highest commanded speed [m/s] (99 % quantile), and the share of the run at it.
 
-    A row is held at the top where the mean command around it is at least ``share_of_top`` of it: a joystick jitters. 0, 0 without commands.
+    A row counts as at the top if the mean command around it (joystick jitter) is at least ``share_of_top`` of it. 0, 0
+    without commands.
     """
     part, command = _select_known_command(rows)
     half = rows.count(window_s / 2)

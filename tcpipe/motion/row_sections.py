@@ -1,6 +1,7 @@
-"""Rows of a regular track in uninterrupted pieces: runs, durations, windows and slopes that never reach across a hole.
+"""Rows of a regular track in uninterrupted pieces: runs, durations, windows and slopes that never cross a gap.
 
-A piece ends where the stamps make a step other than the track's period, or where a clock epoch begins (docs/explanation/rulings.md, Gaps).
+A piece ends at a step of the stamps other than the track's period, or at a new clock epoch
+(docs/explanation/rulings.md, Gaps).
 """
 
 from __future__ import annotations
@@ -104,10 +105,10 @@ def compute_window_mean(value: Floats, piece: Ints, *, before: int, after: int) 
 
 
 def fit_slope(value: Floats, piece: Ints, *, half_window: int, period_s: float) -> Floats:
-    """Return the least-squares slope over 2 half_window + 1 rows around each, one-sided at a piece's ends, per second, shape (N,).
+    """Return the slope over 2 half_window + 1 rows around each [1/s], one-sided at a piece's ends, shape (N,).
 
-    This is the first derivative of Savitzky and Golay (1964) of order one or two; white noise s in the value gives
-    s / period_s / sqrt(n (n² - 1) / 12) in the slope of n rows. A piece of one row has slope 0.
+    By least squares: the first derivative of Savitzky and Golay (1964) of order one or two; white noise s in the value
+    gives s / period_s / sqrt(n (n² - 1) / 12) in the slope of n rows. A piece of one row has slope 0.
     """
     first, last = _make_window(piece, half_window, half_window)
     low, _ = find_piece_bounds(piece)

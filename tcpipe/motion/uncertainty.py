@@ -1,17 +1,17 @@
-"""How far two estimated positions may be wrong *against each other*: what a cost per metre suffers from.
+"""Error of two estimated positions *relative to each other*, on which the error of a cost per metre depends.
 
-The absolute error of an RTK or dead-reckoned position is nearly the same at both ends of a metre and cancels. How nearly a smoother
-knows exactly, and states for some durations (`interpolate_durations_m`). Elsewhere, as at the end of a track and in a forward filter,
-it follows from what a track states of every row.
-Over a short time the error of the displacement is that of the velocity, sigma_v T; over a long time it is that of two independent
-positions, hypot(sigma_1, sigma_2). A position error that is correlated in time like 1 / (1 + t² / (2 tau²)), with
-tau = sigma_position / sigma_velocity as both variances demand, gives in between::
+The absolute error of an RTK or dead-reckoned position is nearly the same at both ends of a metre and cancels. The exact
+remainder is known to a smoother, which states it for some durations (`interpolate_durations_m`). Elsewhere, as at the
+end of a track and in a forward filter, it follows from each row's standard deviations.
+Over a short time the error of the displacement is that of the velocity, sigma_v T; over a long time it is that of two
+independent positions, hypot(sigma_1, sigma_2). A position error that is correlated in time like 1 / (1 + t² / (2
+tau²)), with tau = sigma_position / sigma_velocity as both variances demand, gives in between::
 
     1 / variance = 1 / (sigma_v T)² + 1 / (sigma_1² + sigma_2²)
 
-It grows at most linearly from what the smoother states for a shorter duration, and is no less than the change of the position error
-itself, |sigma_2 - sigma_1| (both by the triangle inequality); and in a forward filter a fix that shrinks the error moves the estimate, by
-sqrt(sigma_1² - sigma_2²).
+It grows at most linearly from the smoother's value for a shorter duration, and is no less than the change of the
+position error, |sigma_2 - sigma_1| (both by the triangle inequality); and in a forward filter a fix that reduces the
+error moves the estimate, by sqrt(sigma_1² - sigma_2²).
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ def compute_displacement_std_m(
 ) -> Floats:
     """Return the standard deviation of the displacement between two estimated positions [m], shape (M,).
 
-    It is the smoother's (`interpolate_durations_m`), elsewhere as the other deviations allow: ``velocity_std_mps`` and ``start_std_m``,
-    ``end_std_m`` along the displacement; ``smoothed`` positions come from a fixed-interval smoother rather than a forward filter.
+    It is the smoother's (`interpolate_durations_m`), elsewhere derived from ``velocity_std_mps``, ``start_std_m`` and
+    ``end_std_m`` along the displacement; ``smoothed`` positions come from a fixed-interval smoother rather than a
+    forward filter.
     """
     change = np.abs(end_std_m - start_std_m)
     if not smoothed:
@@ -53,10 +54,10 @@ def compute_displacement_std_m(
 
 
 def interpolate_durations_m(duration_s: Floats, *, lags_s: Sequence[float], lag_std_m: Floats) -> Floats:
-    """Return the displacement error over each duration [s] from that over some, [m], shape (M,); NaN where that is unknown.
+    """Return the displacement error over each duration [s] from that over lags, [m], shape (M,); NaN if unknown.
 
-    Between two lags it is a power of time, below the shortest that of a constant velocity error. ``lags_s`` [s] are L lags,
-    increasing; ``lag_std_m`` [m], shape (M, L), is above 0 or NaN.
+    Between two lags it is a power of time, below the shortest that of a constant velocity error. ``lags_s`` [s]: L
+    lags, increasing; ``lag_std_m`` [m], shape (M, L), is above 0 or NaN.
     """
     known = np.array(lags_s)
     after = np.clip(np.searchsorted(known, duration_s), 1, len(known) - 1)
@@ -90,7 +91,8 @@ def compute_chord_ahead_std_m(
 ) -> Floats:
     """Return for each row the displacement error over the next chord at the row's speed [m], shape (N,).
 
-    See `compute_displacement_std_m`; the deviations are those of the forward velocity and of the position along the direction of travel.
+    See `compute_displacement_std_m`; the σ are of the forward velocity and of the position along the direction of
+    travel.
     Rows slower than ``slowest_mps`` [m/s] are taken as this fast.
     """
     _, high = find_piece_bounds(rows.piece)
@@ -109,7 +111,7 @@ def compute_chord_ahead_std_m(
 
 
 def find_common_scale_std(facts: FuseFacts | None, stamp_ns: Ints, clock_epoch: Ints) -> Floats:
-    """Return the standard deviation of the unobservable scale of distances at each time, shape (N,): one error of its whole section."""
+    """Return σ of the unobservable scale of distances at each time, shape (N,): one common error of its section."""
     std = np.zeros(len(stamp_ns))
     for section in facts.stretches if facts else ():
         inside = (clock_epoch == section.clock_epoch) & (stamp_ns >= section.start_ns) & (stamp_ns <= section.end_ns)

@@ -1,11 +1,13 @@
 """Vibration: root mean square of the specific force between 3 and 20 Hz, without gravity, steering and slopes.
 
-The band-pass filter is a Butterworth filter of fourth order, forwards and backwards (no delay; gain one half at either edge), computed in
-the frequency domain. At 1 m/s the band contains wavelengths of 5 to 33 cm; an IMU at 50 Hz measures it as well as one at 400 Hz.
+The band-pass filter is a Butterworth filter of fourth order, forwards and backwards (no delay; gain one half at either
+edge), computed in the frequency domain. At 1 m/s the band contains wavelengths of 5 to 33 cm; an IMU at 50 Hz measures
+it as well as one at 400 Hz.
 
-A segment is short, so that its mean square varies by chance from one segment of the same ground to the next. The standard deviation of a
-vibration is that variation. For a stationary process the variance of a mean square over T seconds is its square times k / T (Bendat and
-Piersol, Random Data, 4th ed., 8.2.2: k = 1 / B for white noise of bandwidth B); k is estimated from differences of near batches.
+A segment is short, so that its mean square varies by chance from one segment of the same ground to the next. The
+standard deviation of a vibration is that variation. For a stationary process the variance of a mean square over T
+seconds is its square times k / T (Bendat and Piersol, Random Data, 4th ed., 8.2.2: k = 1 / B for white noise of
+bandwidth B); k is estimated from differences of near batches.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ _GAP_PERIODS = 3.0
 _RINGS_S = 1.0 / LOW_HZ
 """Time around a gap that the filter spreads it over [s]."""
 _BATCH_S = 1.0
-"""Length of a batch whose mean square is compared with that of the next but one [s]: long beside the correlation time of a resonance."""
+"""Length of a batch whose mean square is compared with that of the next but one [s]: longer than the correlation time
+of a resonance."""
 _MEDIAN_CHI2 = 0.4549
 """Median of a chi-square distribution with one degree of freedom."""
 _NS = 1e-9
@@ -33,11 +36,11 @@ _NS = 1e-9
 def compute_vibration_mps2(
     stamp_ns: Ints, specific_force_mps2: Floats, start_ns: Ints, end_ns: Ints
 ) -> tuple[Floats, Floats]:
-    """Return the root mean square over each span of the band-passed specific force, and its standard deviation [m/s²], shape (M,) each.
+    """Return the RMS over each span of the band-passed specific force, and its σ [m/s²], shape (M,) each.
 
-    The three axes count together. NaN if the sensor is slower than 50 Hz, has a gap of more than three periods in the span or near it, or
-    does not cover the span. Samples are of one clock epoch, in any order; of several at one stamp the first counts.
-    The force, shape (N, 3), is finite, in the sensor's axes.
+    The three axes are combined. NaN if the sensor is slower than 50 Hz, has a gap of more than three periods in or near
+    the span, or does not cover it. Samples are of one clock epoch, in any order; of several at one stamp the first
+    counts. The force, shape (N, 3), is finite, in the sensor's axes.
     """
     unknown = np.full(len(start_ns), np.nan)
     if (np.diff(stamp_ns) <= 0).any():
@@ -69,7 +72,7 @@ def compute_vibration_mps2(
 
 
 def _estimate_relative_variance_s(square: Floats, period_s: float) -> float:
-    """Return k [s]: the relative variance of a mean square over T seconds is k / T; NaN if the samples do not fill three batches."""
+    """Return k [s]: a mean square over T seconds has relative variance k / T; NaN for less than three batches."""
     size = round(_BATCH_S / period_s)
     means = square[: len(square) // size * size].reshape(-1, size).mean(axis=1)
     both = means[:-2] + means[2:]

@@ -1,9 +1,9 @@
 """Costs of a metre along 16 courses in the cells of a coarse grid over a map (ADR-27).
 
-A cell is a square of ``cell_size_m`` map metres; its cost along a course is that of the metre of ground around its middle,
-driven that way. The courses are the directions to the nearest 16 cells that can be reached without passing another's centre:
-(1, 0), (2, 1), (1, 1), (1, 2) and so on: 0°, 26.6°, 45°, 63.4°, 90° …, counter-clockwise from the grid's east. A path of such
-steps is at most 1 / cos(13.3°) - 1 = 2.8 % longer than a straight line.
+A cell is a square of ``cell_size_m`` map metres; its cost along a course is that of the metre of ground around its
+middle, driven in that direction. The courses are the directions to the nearest 16 cells that can be reached without
+passing another's centre: (1, 0), (2, 1), (1, 1), (1, 2) and so on: 0°, 26.6°, 45°, 63.4°, 90° …, counter-clockwise from
+the grid's east. A path of such steps is at most 1 / cos(13.3°) - 1 = 2.8 % longer than a straight line.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ BARRED = NO_COST | Reason.OBSTACLE
 
 
 def make_grid(source: MapReader, cell_size_m: float) -> MapGrid:
-    """Return the grid of cells: from the map's north-west corner, as many as fit whole. `MapError`: the map is smaller than a cell."""
+    """Return the grid of whole cells from the map's north-west corner; `MapError`: the map is smaller than a cell."""
     grid = source.grid
     cells = [int(size * grid.pixel_size_m / cell_size_m + 1e-6) for size in (grid.rows, grid.cols)]
     if min(cells) < 1:
@@ -128,7 +128,7 @@ class CostGrid:
         return np.asarray(self.power_watt * slowness if objective == "energy" else slowness)
 
     def open_courses(self, *, allow_extrapolation: bool) -> Mask:
-        """Return the courses that may be driven, shape (16, rows, cols): without obstacle, and inside the training range."""
+        """Return the courses without obstacle and inside the training range, shape (16, rows, cols)."""
         forbidden = np.uint16(BARRED) if allow_extrapolation else np.uint16(0xFFFF)
         return np.asarray(self.reasons & forbidden == 0)
 
@@ -167,7 +167,7 @@ def make_empty_grid(grid: MapGrid) -> CostGrid:
 
 
 def iterate_blocks(source: MapReader, model: Model, grid: MapGrid, wanted: Mask | None = None) -> Iterator[Cells]:
-    """Yield flat indices of cells, at most `CELLS_OF_BLOCK` together, by tile of the map, so that each tile is decoded once.
+    """Yield flat indices of up to `CELLS_OF_BLOCK` cells by tile of the map, so that each tile is decoded once.
 
     A map wider than 29 tiles is cut into strips; the tiles at their borders are decoded twice.
 
@@ -212,7 +212,7 @@ class CellFrames:
         return PatchFrames(np.repeat(centre, COURSES, axis=0), along, np.stack([-along[:, 1], along[:, 0]], axis=1))
 
     def metres(self, cells: Cells) -> Floats:
-        """Return ground metres a map metre along each course at the cells, shape (16,), linear between the grid's corners."""
+        """Return ground metres a map metre by course at the cells, shape (16,), linear between the grid's corners."""
         down, right = np.divmod(cells, self._grid.cols)
         v, u = down.mean() / max(self._grid.rows - 1, 1), right.mean() / max(self._grid.cols - 1, 1)
         (north_west, north_east), (south_west, south_east) = self._corners

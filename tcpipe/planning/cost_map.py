@@ -3,12 +3,12 @@
 ::
 
     cost-map.json                      sources, courses, reasons, shares, checksums
-    power.tif velocity.tif             [W], [m/s]: a band a course, then min, mean, best course, std over the trusted courses
+    power.tif velocity.tif             [W], [m/s]: a band a course; min, mean, best course, std over trusted courses
     duration.tif energy.tif            [s/m], [J/m]: the same
     reasons.tif                        `Reason` bits: a band a course, then those that all courses share
     height.tif                         of the cells' middles [m]
     duration.{yaml,pgm} energy.{…}     Nav2 maps of the mean over the trusted courses
-    keepout.{yaml,pgm} speed.{…}       masks of Nav2's costmap filters: ground without a trusted course, and the mean velocity
+    keepout.{yaml,pgm} speed.{…}       Nav2 costmap filter masks: ground without a trusted course; mean velocity
     nav2.yaml                          parameters of Nav2 for these maps
 """
 
@@ -150,7 +150,10 @@ class CostMapResult:
         return clean_lines(
             (
                 head,
-                f"{cells.with_cost} cells with a cost, {cells.trusted} of them within the training range along some course",
+                (
+                    f"{cells.with_cost} cells with a cost, "
+                    f"{cells.trusted} of them within the training range along some course"
+                ),
                 *((f"cells and courses: {reasons}",) if reasons else ()),
             )
         )
@@ -175,15 +178,15 @@ def make_cost_map(
     Parameters
     ----------
     model, source : the model and the map.
-    out : its directory: new, empty, or a cost map, which is replaced unless its inputs are the same; or a URL in a bucket, where it
-        becomes the newest build, and an interrupted call starts again.
+    out : its directory: new, empty, or a cost map, which is replaced unless its inputs are the same; or a URL in a
+        bucket, where it becomes the newest build, and an interrupted call starts again.
     cell_size_m : side of a cell in the map's plane [m].
-    origin_deg : longitude and latitude of the origin of the Nav2 maps, whose axes are true east and north; without one they are in the
+    origin_deg : longitude and latitude of the origin of the Nav2 maps, with true east and north axes; default: the
         plane of the map's CRS.
     step : called with how many blocks of how many are done.
 
-    Raises `ModelError` or `MapError` if the map lacks a layer, is smaller than a cell or cannot be read; `UsageError` or `StoreError` if
-    ``out`` is something else or cannot be written, or the origin is far from the map.
+    Raises `ModelError` or `MapError` if the map lacks a layer, is smaller than a cell or cannot be read; `UsageError`
+    or `StoreError` if ``out`` is something else or cannot be written, or the origin is far from the map.
     """
     check_model(model, source)
     key, out = make_cost_map_key(model, source, cell_size_m), str(out).rstrip("/")
@@ -200,8 +203,9 @@ def make_cost_map(
             scales = _write_files(directory, _Strips(costs, model.errors, read_classes(source, grid)), frame)
             cells, shares = _compute_shares(costs)
             card = CostMapCard(
-                key=key, map=source.name, model=model.checksum, robot=model.card.robot, label_energy=model.card.label_energy, grid=grid,
-                nav2_scale=scales, cells=cells, reason_share=shares, checksums=compute_checksums(directory), origin_deg=origin_deg,
+                key=key, map=source.name, model=model.checksum, robot=model.card.robot,
+                label_energy=model.card.label_energy, grid=grid, nav2_scale=scales, cells=cells, reason_share=shares,
+                checksums=compute_checksums(directory), origin_deg=origin_deg,
             )  # fmt: skip
             write_sealed(directory / CARD, card)
     return CostMapResult(out, "done", card)
@@ -245,7 +249,7 @@ def open_cost_map(path: Path, card: CostMapCard) -> CostGrid:
 
 @contextmanager
 def _claim_spool(out: str) -> Iterator[Path]:
-    """Yield a directory for finished cells: beside ``out``, for one process at a time, where it stays after an interruption."""
+    """Yield a directory for finished cells beside ``out``, locked by one process and kept after an interruption."""
     if is_url(out):
         with make_scratch_directory() as scratch:
             yield scratch
@@ -325,7 +329,8 @@ class _Strips:
     def compute(self, name: str, first: int, last: int) -> Floats32:
         """Return a quantity of rows, and its minimum, mean, best course and standard deviation, shape (20, rows, cols).
 
-        The last four are over the courses without a reason. The standard deviation is that of a metre, mean over the courses.
+        The last four are over the courses without a reason. The standard deviation is that of a metre, averaged over
+        the courses.
         """
         power, velocity = self.costs.power_watt[:, first:last], self.costs.velocity_mps[:, first:last]
         values = {"power": power, "velocity": velocity}.get(name)
@@ -369,7 +374,7 @@ def _resample(values: Bytes, outside: int, grid: MapGrid, frame: Frame) -> tuple
 
 
 def _write_nav2(path: Path, strips: _Strips, name: str, frame: Frame) -> Nav2Scale:
-    """Write the mean over the trusted courses from 0 to `HIGHEST` on a grid of the frame; return what these two stand for."""
+    """Write the mean over the trusted courses, scaled to 0..`HIGHEST`, on a grid of the frame; return the scale."""
     mean = _compute_mean(strips, name)
     known = np.isfinite(mean)
     low, high = np.percentile(mean[known], (1.0, 99.0)).tolist() if known.any() else (0.0, 1.0)

@@ -1,7 +1,8 @@
-"""Predictions of a model for 1 m segments of ground, and the reasons against each: no data, not traversable, outside the training range.
+"""Predictions for 1 m segments of ground, and the reasons against each: no data, not traversable, outside training.
 
-A prediction outside the training range is a guess, so every segment has its reasons. The ranges are the smallest and largest values of
-training, not quantiles. Segments are processed in batches; a thread samples the next batch while the model predicts.
+A prediction outside the training range is a guess, so every segment has its reasons. The ranges are the smallest and
+largest values of training, not quantiles. Segments are processed in batches; a thread samples the next batch while the
+model predicts.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from tcpipe.terrain.tiles import MapReader, TilePool, choose_level
 
 
 def check_model(model: Model, source: MapReader, *, needs_energy: bool = True) -> None:
-    """Raise `ModelError` if a map cannot give the model what it was trained on, or the model lacks energy; all problems at once."""
+    """Raise `ModelError` with all inputs of the model that the map lacks, and if the model lacks energy."""
     problems = []
     if needs_energy and model.card.inputs.is_time_alone:
         problems.append(
@@ -101,7 +102,7 @@ class Reason(IntFlag):
     CURVED = 1 << 9
     """The path is more curved here than any training segment (its recipe's `max_arc_to_chord`)."""
     LAYER_OUTSIDE_TRAINING = 1 << 10
-    """The mean of a band of a layer of yours, or the share of a class of it, is farther from that of training than in any sample."""
+    """Mean of a band of a user's layer, or share of a class, farther from the training mean than any sample."""
 
 
 NO_COST = Reason.OUTSIDE_MAP | Reason.NODATA | Reason.NOT_TRAVERSABLE | Reason.NO_MOTION
@@ -117,7 +118,7 @@ def count_reasons(bits: Bits) -> dict[str, int]:
 
 
 def find_reasons(patches: Patches, on_map: Mask, model: Model, source: MapReader) -> Bits:
-    """Return the reasons of each patch of a map, shape (N,); ``on_map`` says whether it lies wholly on it, shape (N,)."""
+    """Return the reasons of each patch of a map, shape (N,); ``on_map``: whether it is wholly on it, shape (N,)."""
     bits = np.zeros(on_map.size, np.uint16)
     bits[patches.valid_fraction < 1.0] |= np.uint16(Reason.NODATA)
     ranges = {
@@ -139,7 +140,7 @@ def find_reasons(patches: Patches, on_map: Mask, model: Model, source: MapReader
 
 
 def _find_class_reasons(patches: Patches, terrain: Bytes, model: Model, source: MapReader) -> Bits:
-    """Return the reasons by class: not traversable, or not in training; a model of another class table has no terrain input."""
+    """Return the reasons by class: not traversable, or not in training; ignored with another class table."""
     traversable = source.classes.traversable()
     bits = np.zeros(len(terrain), np.uint16)
     bits[~traversable[patches.terrain_class]] |= np.uint16(Reason.NOT_TRAVERSABLE)
@@ -169,9 +170,9 @@ BATCH = 4_096
 class SegmentPredictions:
     """Predictions for N metres, shape (N,): `Reason` bits, costs (NaN without a prediction), and the ground.
 
-    Predictions are centred (`tcpipe.cost.prediction_errors`); ``duration_std_s`` and ``energy_std_joule`` are the standard deviations that
-    the model states for a metre, 0 without one. ``velocity_mps`` is horizontal, whichever velocity the model predicts. ``height_m`` is that
-    of the metre's middle, NaN if the map has none.
+    Predictions are centred (`tcpipe.cost.prediction_errors`); ``duration_std_s`` and ``energy_std_joule`` are the
+    model's own standard deviations for a metre, 0 without one. ``velocity_mps`` is horizontal, whichever velocity the
+    model predicts. ``height_m`` is that of the metre's middle, NaN if the map has none.
     """
 
     reasons: Bits
@@ -238,10 +239,10 @@ def iterate_predictions(
 
 
 def predict_patches(model: Model, patches: Patches, asked: Mask, turn_radpm: Floats) -> Prediction:
-    """Return power [W] and velocity [m/s] of N patches; NaN where the model is not asked, or predicts no motion.
+    """Return power [W] and velocity [m/s] of N patches; NaN if not asked, or if no motion is predicted.
 
-    ``asked`` and ``turn_radpm``, how far a metre of each turns (NaN: as usual), have shape (N,). The speed that is commanded is the
-    usual. Raises `ModelError` where the model gives something else than power and velocity.
+    ``asked`` and ``turn_radpm``, the turn of a metre (NaN: as usual), have shape (N,). The commanded speed is the usual
+    one. Raises `ModelError` if the model returns something else than power and velocity.
     """
     form = model.card.layout
     pixels = {layer: patches.pixels[layer] for layer in form.layers}
@@ -252,7 +253,8 @@ def predict_patches(model: Model, patches: Patches, asked: Mask, turn_radpm: Flo
         said = model.ask(form.form(pixels, rows), extra_features.take(rows))
         if said.mean.shape[1] != 2:
             raise ModelError(
-                f"{model.name}: gives {said.mean.shape[1]} numbers a patch, expected two: power and velocity; train it on both labels"
+                f"{model.name}: gives {said.mean.shape[1]} numbers a patch, expected two: power and velocity; "
+                "train it on both labels"
             )
         out.mean[rows], out.covariance[rows] = said.mean, said.covariance
     needed = out.mean[:, 1:] if model.card.inputs.is_time_alone else out.mean

@@ -93,14 +93,15 @@ class DriveCost:
 
 
 def find_drive(store: Store, log: str) -> StoredRun:
-    """Return the run of a log, by the path or URL of the log, RUN or RUN/RECIPE; `UsageError` without one, or with several."""
+    """Return the run of a log (path, URL, RUN or RUN/RECIPE); `UsageError` for no run or several."""
     state = store.scan()
     found = store.find_runs(log, state) or [
         run for run in store.runs(state) if make_absolute(log) in run.facts.log.paths
     ]
     if not found:
         raise UsageError(
-            f"{log}: {store.root} has no run of this log or name; expected the path of an ingested log, a run or RUN/RECIPE"
+            f"{log}: {store.root} has no run of this log or name; "
+            "expected the path of an ingested log, a run or RUN/RECIPE"
         )
     if len(found) > 1:
         names = ", ".join(run.name for run in found)
@@ -121,10 +122,10 @@ def predict_run(
     sample: SampleConfig | None = None,
     shift: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> tuple[MeasuredRun, Reasons]:
-    """Return the predictions and labels of a run's segments in order, and the reasons against the comparison of each.
+    """Return predictions and labels of a run's segments in order, and reasons against comparing each.
 
-    ``gnss_crs`` is of the fixes (None: as the run was ingested); ``sample`` limits the position's standard deviation; ``shift`` moves the
-    run on the map (x, y) and adds to its standard deviation [m].
+    ``gnss_crs``: of the fixes (None: as ingested); ``sample`` limits the position's standard deviation; ``shift`` moves
+    the run on the map (x, y) and adds to its standard deviation [m].
     """
     check_model(model, source)
     segments = run.segments().sort_by("start_ns")
@@ -166,10 +167,10 @@ def predict_run(
 def collect_runs(
     model: Model, source: MapFile, store: Store, logs: Sequence[str], data: Dataset | None = None
 ) -> list[MeasuredRun]:
-    """Return the labelled segments of drives on ground that the model knows, predicted and measured; `UsageError` if one has none.
+    """Return drives' labelled segments on known ground, predicted and measured; `UsageError` for a drive without any.
 
-    They may be of another robot, payload or season: a model is adapted by them. They are moved onto the map as the dataset's recipe says
-    (``sample.align``), without one by the default.
+    They may be of another robot, payload or season, for adaptation of a model. They are moved onto the map by the
+    dataset's recipe (``sample.align``), without one by the default.
     """
     runs = [find_drive(store, log) for log in logs]
     recipe = replace(Recipe(), read=runs[0].manifest.recipe.read) if data is None else data.card.recipe
@@ -204,7 +205,7 @@ def compute_drive_cost(
 ) -> DriveCost:
     """Return the measured and predicted cost of a drive.
 
-    ``data`` is the dataset that the model was trained on; ``log`` is the user's name of the drive; ``shifts`` are of runs on the map.
+    ``data``: the model's training dataset; ``log``: the user's name of the drive; ``shifts``: of runs on the map.
     `ModelError`, `UsageError`: it is of another robot, or has no segments.
     """
     if run.facts.robot != model.card.robot:
@@ -217,7 +218,8 @@ def compute_drive_cost(
     errors, trained, length_m = model.errors, data["train"], found.metres["energy"].length_m
     near = are_near(
         compute_middles([to_floats(segments, name) for name in PLACES]),
-        compute_middles([trained.column(name) for name in PLACES]), within_m=CLOSE * model.card.chord_m, in_degrees=True,
+        compute_middles([trained.column(name) for name in PLACES]),
+        within_m=CLOSE * model.card.chord_m, in_degrees=True,
     )  # fmt: skip
     is_good = np.array([not why for why in reasons], np.bool_)
     good = {name: metres.take(is_good) for name, metres in found.metres.items()}
@@ -242,19 +244,24 @@ def format_drive(drive: DriveCost) -> list[str]:
     """Return a drive as plain lines."""
     rest = ", ".join(f"{metres:.0f} m {name.replace('_', ' ')}" for name, metres in drive.rest_m.items())
     lines = [
-        f"{drive.run_id}: {drive.compared_m:.0f} of {drive.driven_m:.0f} m driven are compared; {drive.segments_m:.0f} m are in segments"
-        + (f", of them not compared: {rest}" if rest else ""),
-        f"{drive.run_id}: {drive.near_training_percent:.0f} % of its segments are within {CLOSE:g} chords of a training sample",
+        f"{drive.run_id}: {drive.compared_m:.0f} of {drive.driven_m:.0f} m driven are compared; "
+        f"{drive.segments_m:.0f} m are in segments" + (f", of them not compared: {rest}" if rest else ""),
+        (
+            f"{drive.run_id}: {drive.near_training_percent:.0f} % of its segments "
+            f"are within {CLOSE:g} chords of a training sample"
+        ),
     ]
     above = ", net" if drive.label_energy == "net" else ""
     for called, value, unit in (("time", drive.duration_s, "s"), (f"energy{above}", drive.energy_joule, "J")):
         if drive.compared_m:
             interval = (
                 "no interval" if value.low is None or value.high is None
-                else f"{'inside' if value.held else 'OUTSIDE'} the {COVERAGE:.0%} prediction interval {value.low:.0f} to {value.high:.0f}"
+                else f"{'inside' if value.held else 'OUTSIDE'} the {COVERAGE:.0%} prediction interval "
+                f"{value.low:.0f} to {value.high:.0f}"
             )  # fmt: skip
             lines.append(
-                f"{drive.run_id}: {called} {value.measured:.0f} {unit} measured, {value.predicted:.0f} {unit} predicted "
+                f"{drive.run_id}: {called} {value.measured:.0f} {unit} measured, "
+                f"{value.predicted:.0f} {unit} predicted "
                 f"({value.off_percent:+.1f} %; {interval})"
             )
     return lines
@@ -298,7 +305,7 @@ def evaluate_drives(
 
     If the dataset's runs were moved onto their map (``sample.align``), drives are moved, too.
 
-    Raises `ModelError`, `MapError` or `UsageError` where the model, the map or a drive cannot be used, or ``out`` is a file.
+    Raises `ModelError`, `MapError` or `UsageError` if model, map or a drive cannot be used, or ``out`` is a file.
     """
     opened = open_store(store)
     runs = [find_drive(opened, log) for log in logs]
@@ -327,7 +334,8 @@ def check_origin(model: Model, data: Dataset) -> None:
     card = model.card
     if compute_dataset_checksum(data.card) != card.dataset.sha256:
         raise ModelError(
-            f"{model.name}: was trained on another dataset ({card.dataset.name}, {card.dataset.sha256[:12]}) than {data.path}; "
+            f"{model.name}: was trained on another dataset ({card.dataset.name}, "
+            f"{card.dataset.sha256[:12]}) than {data.path}; "
             "expected that one, to find out whether a drive was held back"
         )
 

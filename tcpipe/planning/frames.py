@@ -1,4 +1,4 @@
-"""Frames of robots on maps: true east-north-up metres at an origin, as robot_localization's map frame, or the plane of the map's CRS.
+"""Frames of robots on maps: true east-north-up metres at an origin (robot_localization), or the plane of the map's CRS.
 
 The grid of a CRS is turned against true north by the meridian convergence, up to 3° in a UTM zone: 10 m at 300 m.
 """
@@ -85,7 +85,7 @@ class Frame:
         return MapGrid("ENU", left, top, size, rows, cols)
 
     def find_cells(self, grid: MapGrid, own: MapGrid) -> tuple[Ints, Mask]:
-        """Return the flat cell of ``grid`` under the middle of each cell of the frame's ``own`` grid, and which lie on it."""
+        """Return the flat cell of ``grid`` under the middle of each ``own`` cell of the frame, and which are on it."""
         row, col = np.mgrid[: own.rows, : own.cols]
         middle = own.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(np.float64))
         px = np.rint(grid.px_from_xy(self.to_plane(middle))).astype(np.int64)
@@ -101,7 +101,9 @@ def make_frame(source: MapReader, origin_deg: tuple[float, float] | None) -> Fra
         off_m = np.hypot(x_m - np.clip(x_m, x_min, x_max), y_m - np.clip(y_m, y_min, y_max))
         if not off_m <= _FARTHEST_ORIGIN_M:
             raise UsageError(
-                f"--origin {origin_deg[0]:g},{origin_deg[1]:g}: is {off_m / 1000.0:.0f} km from map {source.name}, expected at most "
-                f"{_FARTHEST_ORIGIN_M / 1000.0:.0f}; give LON,LAT (longitude first) of the origin of the robot's map frame"
+                f"--origin {origin_deg[0]:g},{origin_deg[1]:g}: is {off_m / 1000.0:.0f} km from map {source.name}, "
+                "expected at most "
+                f"{_FARTHEST_ORIGIN_M / 1000.0:.0f}; give LON,LAT (longitude first) of the origin of the robot's map "
+                "frame"
             )
     return Frame(source, origin_deg)

@@ -53,8 +53,8 @@ class PathTotals:
     turn_rad: float = 0.0
     """Sum of turns in both directions."""
     turn_energy_joule: float | None = None
-    """Energy of turns beyond those of the training segments; None without the robot's physics, and for models with turns as input, whose
-    energies include it."""
+    """Energy of turns beyond those of the training segments; None without the robot's physics, and for models with
+    turns as input, whose energies include it."""
     duration_interval_s: tuple[float, float] | None
     """Interval of what the robot's own sensors will measure; None, as that of energy, without held-out samples."""
     energy_interval_joule: tuple[float, float] | None
@@ -145,7 +145,7 @@ def _cut_into_segments(
 
 
 def find_added_turning(model: Model) -> Turning | None:
-    """Return the cost of turns besides a model's predictions; None if turns are an input, or without the robot's physics."""
+    """Return the cost of turns not in a model's predictions; None if turns are an input, or without physics."""
     return None if model.takes_turns else find_turning(model.card.physics, model.card.class_table)
 
 
@@ -279,15 +279,24 @@ PATH_SEGMENTS = TableSchema(
         Column("terrain_class", pa.uint8(), "", "Majority class under the chord; 0: none."),
         Column("terrain_name", pa.string(), "", "Name of that class."),
         Column("slope_rad", _F, "rad", "Slope along travel, uphill positive.", nullable=True),
-        Column("cross_slope_rad", _F, "rad", "Slope across travel, positive when the left side is higher.", nullable=True),
-        Column("power_watt", _F, "W", "Predicted mean power; null without a cost, as all following columns.", nullable=True),
+        Column(
+            "cross_slope_rad", _F, "rad", "Slope across travel, positive when the left side is higher.", nullable=True
+        ),
+        Column(
+            "power_watt", _F, "W", "Predicted mean power; null without a cost, as all following columns.", nullable=True
+        ),
         Column("velocity_mps", _F, "m/s", "Predicted ground velocity.", nullable=True),
         Column("duration_s", _F, "s", "Predicted time: arc length over velocity.", nullable=True),
         Column("duration_low_s", _F, "s", "Lower end of its 90 % interval.", nullable=True),
         Column("duration_high_s", _F, "s", "Upper end of its 90 % interval.", nullable=True),
         Column("turn_rad", _F, "rad", "Turn: half of the change of course at either end."),
-        Column("turn_energy_joule", _F, "J", "Energy of the turn beyond the turns of training; null without physics.", nullable=True),
-        Column("energy_joule", _F, "J", "Predicted energy: power times time, plus the energy of the turn.", nullable=True),
+        Column(
+            "turn_energy_joule", _F, "J",
+            "Energy of the turn beyond the turns of training; null without physics.", nullable=True,
+        ),
+        Column(
+            "energy_joule", _F, "J", "Predicted energy: power times time, plus the energy of the turn.", nullable=True
+        ),
         Column("energy_low_joule", _F, "J", "Lower end of its 90 % interval.", nullable=True),
         Column("energy_high_joule", _F, "J", "Upper end of its 90 % interval.", nullable=True),
         Column("reasons", pa.uint16(), "bits", "Why it has no cost, or an unreliable one; 0: reliable.", flags=Reason),
@@ -335,7 +344,7 @@ class PathSegments:
     scale: float
 
     def frames(self, chord_m: float) -> PatchFrames:
-        """Return the patch of each path segment; that of a shorter last one ends with it and reaches back over the one before."""
+        """Return the patch of each path segment; that of a shorter last one overlaps the patch before it."""
         along = (self.end_xy_m - self.start_xy_m) / np.linalg.norm(self.end_xy_m - self.start_xy_m, axis=1)[:, None]
         start = self.end_xy_m - along * (chord_m / self.scale)
         return make_patch_frames(start, self.end_xy_m, np.full(len(start), chord_m))

@@ -1,4 +1,4 @@
-"""The files of `tcpipe predict-path` (a table of path segments and its totals) and `tcpipe plan-path` (GeoJSON, and messages for Nav2)."""
+"""Files of `tcpipe predict-path` (path segments, totals) and `tcpipe plan-path` (GeoJSON, messages for Nav2)."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ class PlanResult(PlanTotals):
 
     @property
     def exit_code(self) -> int:
-        """Return 3 if some path segment has no cost, or the budget suffices with less than the probability asked for; else 0."""
+        """Return 3 if a path segment has no cost, or the budget suffices with too low a probability; else 0."""
         return 0 if self.complete and not self._is_budget_too_small else 3
 
     @property
@@ -249,6 +249,7 @@ def _read_costs(path: Path, model: Model, source: MapFile) -> CostGrid:
         raise ModelError(f"{describe_broken(path / CARD)}; make one with tcpipe cost-map")
     if card.key != make_cost_map_key(model, source, card.grid.pixel_size_m):
         raise ModelError(
-            f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"
+            f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe "
+            "cost-map"
         )
     return open_cost_map(path, card)

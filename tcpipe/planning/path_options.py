@@ -1,4 +1,4 @@
-"""The options of ``tcpipe predict-path``, ``plan-path``, ``cost-map`` and ``route-graph``, and of the functions of these names."""
+"""Options of ``tcpipe predict-path``, ``plan-path``, ``cost-map`` and ``route-graph``, and of their functions."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ class PredictPathOptions:
     predictor: str | None = option(None, PREDICTOR)
     adapt: Location | None = option(
         None,
-        "Adapt MODEL by the labelled metres of a run, of this or another robot: an ingested log, by its path or its run's name.",
+        "Adapt MODEL by the labelled metres of a run, of this or another robot: "
+        "an ingested log, by its path or its run's name.",
         metavar="RUN",
     )
     store: Location = option("tcpipe-store", STORE)

@@ -1,12 +1,12 @@
 """The least-cost path between two points (paper, section I).
 
-A path over a point p is at least as long as the straight lines start-p-goal, so an ellipse contains every path shorter than a bound.
-Without a cost map the model predicts the cells of the ellipse of all paths up to `DETOUR` times as long as the shortest, and the search
-uses these; with a cost map it uses all cells.
+A path over a point p is at least as long as the straight lines start-p-goal, so an ellipse contains every path shorter
+than a bound. Without a cost map the model predicts the cells of the ellipse of all paths up to `DETOUR` times as long
+as the shortest, and the search uses these; with a cost map it uses all cells.
 
-The search knows cells, and a path is judged by its metres. So the search offers several paths: of each objective, with turns and without,
-as steps and as straight lines, and for ``risk`` with several multiples of the standard deviation of a cell added to its cost. The path
-returned is the one that costs least as `tcpipe predict-path` predicts it.
+The search uses cells, but a path is judged by its metres. So the search returns several paths: of each objective, with
+turns and without, as steps and as straight lines, and for ``risk`` with several multiples of the standard deviation of
+a cell added to its cost. The returned path is the one with the least cost predicted by `tcpipe predict-path`.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class PlanTotals(PathTotals):
     negative_steps: int
     """Steps that gain more energy than their height explains; they cost nothing."""
     risk: float | None = None
-    """Probability with which the path takes no more than ``risk_cost``, by which it was chosen; None: by its prediction."""
+    """Probability that the path's cost is at most ``risk_cost``, the criterion; None: chosen by its prediction."""
     risk_cost: float | None = None
     """In the objective's unit."""
     budget_joule: float | None = None
@@ -87,7 +87,7 @@ class Plan:
 
     Attributes
     ----------
-    lonlat_deg, xy_m : its points, WGS 84 and in the map's CRS, shape (P, 2); from the start as given to the goal as given.
+    lonlat_deg, xy_m : its points, WGS 84 and in the map's CRS, shape (P, 2), from the given start to the given goal.
     cost : as `tcpipe predict-path` predicts it.
     totals : its totals, and how it was found.
     """
@@ -121,8 +121,8 @@ def plan_path(
     budget_joule : state the probability that this energy suffices.
     step : called with how many blocks of how many are predicted.
 
-    Raises `PathError` if an end is off the map or on closed ground, or no path connects them; `ModelError` if the model states no errors
-    for ``risk`` or a budget.
+    Raises `PathError` if an end is off the map or on closed ground, or no path connects them; `ModelError` if the model
+    states no errors for ``risk`` or a budget.
     """
     errors = survey.model.errors
     if (risk is not None or budget_joule is not None) and errors is None:
@@ -185,7 +185,7 @@ class _Search:
         return np.asarray(np.clip(row, 0, grid.rows - 1) * grid.cols + np.clip(col, 0, grid.cols - 1))
 
     def check_ends(self) -> None:
-        """Raise `PathError` for ends off the map, on ground that cannot be driven, or nearer than a chord; both at once."""
+        """Raise `PathError` for ends off the map, on closed ground, or nearer than a chord; both ends at once."""
         source, problems = self.survey.source, []
         labels = [
             f"--{name} {lon:.6f},{lat:.6f}" for name, (lon, lat) in zip(("from", "to"), self.ends_deg, strict=True)
@@ -210,7 +210,8 @@ class _Search:
         apart_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]))
         if apart_m < self.survey.model.card.chord_m:
             problems.append(
-                f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; expected at least {self.survey.model.card.chord_m:g} m"
+                f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; "
+                f"expected at least {self.survey.model.card.chord_m:g} m"
             )
         elif len(set(self._cells.tolist())) == 1:
             pixel_size_m = self.survey.costs.grid.pixel_size_m
@@ -221,7 +222,7 @@ class _Search:
             raise PathError(*problems)
 
     def predict_ground(self) -> None:
-        """Predict the cells of all paths up to `DETOUR` times as long as the shortest; `PathError` if there is no path."""
+        """Predict the cells of all paths up to `DETOUR` times as long as the shortest; `PathError` without a path."""
         straight_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]) * self._metres().max())
         bound_m, survey = straight_m * DETOUR, self.survey
         while True:
@@ -250,13 +251,14 @@ class _Search:
                 is_closed = self.allow_extrapolation or common & BARRED
                 hint = "" if is_closed else ", or allow such ground with --allow-extrapolation"
                 problems.append(
-                    f"{label}: no course can be driven from there on map {self.survey.source.name} ({words}); choose another point{hint}"
+                    f"{label}: no course can be driven from there on map {self.survey.source.name} ({words}); choose "
+                    f"another point{hint}"
                 )
         if problems:
             raise PathError(*problems)
 
     def _ellipse(self, bound_m: float) -> Mask:
-        """Return the cells over which a path from start to goal need not be longer than ``bound_m``, and those beside the ends."""
+        """Return the cells of paths from start to goal of length ``bound_m`` or less, and those beside the ends."""
         grid = self.survey.costs.grid
         scale = self._metres().min()
         x = grid.x_min_m + (np.arange(grid.cols) + 0.5) * grid.pixel_size_m
@@ -274,7 +276,7 @@ class _Search:
         errors: QuantityErrors | None = None,
         caution: float = 0.0,
     ) -> tuple[GridSteps, tuple[LeastCostPath, ...]]:
-        """Return the steps over predicted cells and the best paths over them; with the cells' classes, that with turns comes first."""
+        """Return steps over predicted cells and the best paths; with the cells' classes, one with turns is first."""
         costs, (start, goal) = self.survey.costs, self._cells.tolist()
         open_ = costs.open_courses(allow_extrapolation=self.allow_extrapolation) & self.survey.predicted
         per_metre = costs.per_metre(objective)
@@ -292,7 +294,7 @@ class _Search:
     def find_finalists(
         self, objective: Objective, errors: Mapping[str, QuantityErrors] | None
     ) -> tuple[list[Floats], int]:
-        """Return the lines of paths that may be the best, (P, 2) each, and the free steps of the search for the objective.
+        """Return lines of candidate paths, (P, 2) each, and the number of free steps of the objective's search.
 
         They are the best of each objective, and with ``errors`` those of little risk.
         """
@@ -308,7 +310,7 @@ class _Search:
         return list({np.round(line, 3).tobytes(): line for line in lines}.values()), negative
 
     def _draw_lines(self, steps: GridSteps, paths: tuple[LeastCostPath, ...]) -> Iterator[Floats]:
-        """Yield each path in the map's CRS [m], from end to end as they were given: as its steps, and as straight lines that cost less."""
+        """Yield each path in the map's CRS [m] between the given ends: as steps, and as straight lines of less cost."""
         grid = self.survey.costs.grid
         for path in paths:
             points = np.stack(np.divmod(path.cells, grid.cols)[::-1], axis=1).astype(np.float64)

@@ -81,11 +81,11 @@ def write_route_graph(
     ----------
     model, source : the model and the map.
     graph : the graph's file.
-    origin_deg : longitude and latitude of the origin of the graph's frame, true east and north; without one that of the map's CRS.
+    origin_deg : longitude and latitude of the origin of the graph's frame, true east and north; default: the map's CRS.
     two_way : whether an edge is added for each that has none back.
 
-    Raises `PathError`, `ModelError` or `MapError` where the graph, the model or the map cannot be used; `UsageError` or `StoreError` where
-    ``out`` is the graph itself, has a wrong name or cannot be written.
+    Raises `PathError`, `ModelError` or `MapError` if the graph, the model or the map cannot be used; `UsageError` or
+    `StoreError` if ``out`` is the graph, has a wrong name or cannot be written.
     """
     if out.suffix.lower() not in {".geojson", ".json"} or out.is_dir():
         raise UsageError(f"{out}: expected the name of a file that ends in .geojson or .json")

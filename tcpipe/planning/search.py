@@ -1,20 +1,22 @@
 """Least-cost paths over a cost grid: Dijkstra and A* on an implicit graph of 16 courses (ADR-27).
 
-The cost of a step is the integral of the cost a metre, along the step's course, over the cells it crosses. Downhill a metre may cost less
-than zero, which Dijkstra forbids. A potential proportional to height removes the grade: c' = c - k (h_b - h_a) changes all paths from a
-start to a goal by the same amount, so the best path stays the best. k maximises the cost of the cheapest metre; steps that stay negative
-count as zero, and `LeastCostPath` has their number.
+The cost of a step is the integral of the cost a metre, along the step's course, over the cells it crosses. Downhill a
+metre may have a negative cost, which Dijkstra forbids. A potential proportional to height removes the grade: c' = c - k
+(h_b - h_a) changes all paths from a start to a goal by the same amount, so the best path stays the best. k maximises
+the cost of the cheapest metre; steps that stay negative count as zero, and `LeastCostPath` has their number.
 
-Turns cost ``M |turn|`` beyond those of the model's segments, which were nearly straight: the torque of a skid-steered robot hardly depends
-on its turn rate (ADR-13). Turns take no time here. The search with turns has a state for each cell and course. Its bound for A* is the
-exact cost to the goal without turns, which turns can only raise, so that it visits few states and its path is as cheap as that of a full
-search. No step is stored: both searches compute a step's cost when they reach it.
+Turns cost ``M |turn|`` beyond those of the model's segments, which were nearly straight: the torque of a skid-steered
+robot hardly depends on its turn rate (ADR-13). Turns take no time here. The search with turns has a state for each cell
+and course. Its bound for A* is the exact cost to the goal without turns, which turns can only raise, so that it visits
+few states and its path is as cheap as that of a full search. No step is stored: both searches compute a step's cost
+when they reach it.
 
 Replacing steps along 16 courses by straight lines where these are cheaper.
 
-Dijkstra's path has 16 courses and is up to 2.8 % longer than necessary. This finds the cheapest path over a subset of its points, joined by
-straight lines. The cost of a line is its integral over the cells that it crosses, interpolated between the two nearest courses. The result
-never costs more than the steps and crosses no cell that is closed to them.
+Dijkstra's path has 16 courses and is up to 2.8 % longer than necessary. `straighten_path` finds the cheapest path over
+a subset of its points, joined by straight lines. The cost of a line is its integral over the cells that it crosses,
+interpolated between the two nearest courses. The result never costs more than the steps and crosses no cell that is
+closed to them.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ class GridSteps(NamedTuple):
 
     Attributes
     ----------
-    per_metre : cost of a metre in the objective's unit, shape (rows, cols, 16); infinite where a course may not be driven.
+    per_metre : cost of a metre in the objective's unit, shape (rows, cols, 16); infinite for closed courses.
     height_m : of the cells' middles, shape (rows, cols).
     length_m : of the step along each course, on the ground [m], shape (16,).
     crossed : north and east, in cells, of the cells that a step touches, the last one where it ends, shape (16, 4, 2).
@@ -86,7 +88,7 @@ def make_steps(costs: CostGrid, per_metre: Floats32, open_: Mask, metres: Floats
     Parameters
     ----------
     costs, per_metre : the cells, and what a metre costs, shape (16, rows, cols).
-    open_ : where a course may be driven, shape (16, rows, cols): cells a step only touches at a corner must be open, too.
+    open_ : open courses, shape (16, rows, cols); cells that a step touches only at a corner must be open, too.
     metres : ground metres a map metre along each course, shape (16,).
     """
     known_m = costs.height_m[np.isfinite(costs.height_m)]
@@ -111,7 +113,7 @@ def make_steps(costs: CostGrid, per_metre: Floats32, open_: Mask, metres: Floats
 
 @compile_kernel
 def compute_step(steps: GridSteps, k: float, course: int, row: int, col: int) -> float:
-    """Return the cost of a step without the grade ``k``, from a cell along a course; infinite where it cannot be made."""
+    """Return the cost of a step from a cell along a course, without the grade ``k``; infinite if it is closed."""
     rows, cols, _ = steps.per_metre.shape
     row1, col1 = row - steps.crossed[course, 3, 0], col + steps.crossed[course, 3, 1]
     if row1 < 0 or row1 >= rows or col1 < 0 or col1 >= cols:
@@ -130,7 +132,7 @@ def compute_step(steps: GridSteps, k: float, course: int, row: int, col: int) ->
 
 @compile_kernel
 def _bin_by_grade(steps: GridSteps, low: float, high: float, cheapest: Floats) -> tuple[float, float]:
-    """Write the cheapest metre of known steps of each bin of grade from ``low`` to ``high``; return the least and the greatest grade."""
+    """Write the cheapest known metre of each bin of grade from ``low`` to ``high``; return the extreme grades."""
     rows, cols, courses = steps.per_metre.shape
     least, greatest = np.inf, -np.inf
     for row in range(rows):
@@ -149,9 +151,9 @@ def _bin_by_grade(steps: GridSteps, low: float, high: float, cheapest: Floats) -
 
 
 def find_best_potential(steps: GridSteps) -> float:
-    """Return k, the potential a metre of height, that makes the cheapest metre of known steps as dear as can be: a concave search.
+    """Return k, the potential a metre of height that maximises the cheapest metre of known steps (concave search).
 
-    Metres of about the same grade are taken as their cheapest at either end of the bin, so that a step is never dearer than it is.
+    Metres of about the same grade count as the cheapest at either end of their bin, so that no step is overestimated.
     """
     low, high = _bin_by_grade(steps, 0.0, 0.0, np.empty(0))
     if not high - low >= _FLAT:
@@ -169,7 +171,7 @@ def find_best_potential(steps: GridSteps) -> float:
 
 @compile_kernel
 def _fill_costs(steps: GridSteps, k: float, goal: int, out: Floats) -> int:
-    """Write the least cost from each cell to the goal to ``out``, (cells,), infinite before; return the number of free steps."""
+    """Write the least cost from each cell to the goal to ``out``, (cells,), infinite before; return the free steps."""
     rows, cols, courses = steps.per_metre.shape
     negative = 0
     out[goal] = 0.0
@@ -204,16 +206,17 @@ class Turning:
     usual_radpm: float
 
     def energy_joule(self, turn_rad: Floats, length_m: Floats, class_id: Bytes, *, is_driven: bool = False) -> Floats:
-        """Return the cost of turns beyond the usual [J], shape (N,), of N path segments of these lengths on these classes.
+        """Return the cost of turns beyond the usual [J], shape (N,), of N path segments by length and class.
 
-        A driven segment may turn less than usual and cost less; a drawn one counts as usual, since no robot drives as straight as a line.
+        A driven segment may turn less than usual and cost less; a drawn one turns at least as usual, since no robot
+        drives exactly straight.
         """
         beyond_rad = np.abs(turn_rad) - self.usual_radpm * length_m
         return np.asarray(self.joule_per_rad[class_id] * (beyond_rad if is_driven else np.maximum(beyond_rad, 0.0)))
 
 
 def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
-    """Return the cost of turning by a fit, None without such a term; a class without a term has the mean of the others."""
+    """Return the cost of turning by a fit, None without such a term; classes without a term have the mean."""
     found = {} if fit is None else {term.terrain: term.value for term in fit.terms if term.term == "turning"}
     if fit is None or not found:
         return None
@@ -224,7 +227,7 @@ def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
 
 
 def compute_course_changes(start_xy_m: Floats, end_xy_m: Floats) -> Floats:
-    """Return how far each of N path segments turns [rad], shape (N,): half of the change of course at either of its ends, shape (N, 2).
+    """Return the turn of N path segments [rad], shape (N,): half of the course change at both ends, shape (N, 2).
 
     It compares the courses of chords, so that jitter of the drawn points is no turn.
     """
@@ -247,8 +250,8 @@ def _find_turning(  # noqa: PLR0917
 ) -> int:  # fmt: skip
     """Find the least cost with turns by A*; return the last state, a cell times 16 plus a course, or -1.
 
-    ``labels`` and ``arrived``, (16 · cells,), are the cost of each state that is reached, and how it was; both are zeros before: pages
-    that nothing writes to take no memory.
+    ``labels`` and ``arrived``, (16 · cells,): cost of each reached state, and its predecessor; both are zeros before:
+    unwritten pages take no memory.
     """
     cols, courses = steps.per_metre.shape[1:]
     heap = [(to_goal[start], start * courses + course) for course in range(courses)]
@@ -285,8 +288,8 @@ def find_least_cost_paths(  # noqa: PLR0917
 ) -> tuple[LeastCostPath, ...]:
     """Return the least-cost path from a cell to another (flat indices); an empty tuple without one.
 
-    ``k`` is the potential. With the cost of turns, and the class of each cell, shape (rows, cols), the path of least energy with turns
-    is the first.
+    ``k``: the potential. With the cost of turns, and the class of each cell, shape (rows, cols), the path of least
+    energy with turns is the first.
     """
     to_goal = np.full(steps.height_m.size, np.inf)
     negative = _fill_costs(steps, k, goal, to_goal)
@@ -304,7 +307,7 @@ def find_least_cost_paths(  # noqa: PLR0917
 
 
 def _trace_back(state: int, arrived: NDArray[np.int8], steps: GridSteps, k: float) -> tuple[Ints, float, float]:
-    """Return the cells of the path to a state of the search with turns, and what its steps cost, with and without the grade."""
+    """Return the cells of the path to a state of the search with turns, and its cost with and without the grade."""
     cells, raw, reduced = [state // COURSES], 0.0, 0.0
     while (way := int(arrived[state])) != _START:
         cell, course = divmod(state, COURSES)
@@ -326,11 +329,11 @@ SAMPLES_A_CELL = 4
 def find_best_lines(  # noqa: PLR0917
     steps: GridSteps, angles: Floats, metres: Floats, points: Floats, window: int, so_far: Floats, before: Ints
 ) -> None:
-    """Write the cost from the first point to each point of a path, and where its last line begins, to ``so_far`` and ``before``, (P,).
+    """Write the cost to each point of a path, and the start of its last line, to ``so_far`` and ``before``, (P,).
 
-    ``angles``, (16,), are the courses [rad], counter-clockwise from the grid's east, rising from 0; ``metres``, (16,), the ground metres
-    of a cell's side along each. ``points`` [cells] are as in `straighten_path`. A line begins at most ``window`` points earlier; a line
-    between neighbours is a step of the path and always allowed.
+    ``angles``, (16,): courses [rad], counter-clockwise from the grid's east, rising from 0; ``metres``, (16,): ground
+    metres of a cell's side along each. ``points`` [cells]: as in `straighten_path`. A line begins at most ``window``
+    points earlier; a line between neighbours is a step of the path and always allowed.
     """
     so_far[0], before[0] = 0.0, 0
     for j in range(1, points.shape[0]):
@@ -350,7 +353,7 @@ def _compute_line_cost(  # noqa: PLR0917
     end: Floats,
     is_step: bool,  # noqa: FBT001
 ) -> float:
-    """Return the cost of a straight line, of its course by interpolation between the two nearest; infinite where it may not be driven."""
+    """Return the cost of a straight line, interpolated between the two nearest courses; infinite if it is closed."""
     east, north = end[0] - begin[0], begin[1] - end[1]
     length = np.hypot(east, north)
     if length == 0.0:

@@ -28,17 +28,17 @@ Mass = Annotated[float, Bounds(ge=0.1, le=1e6)]
 Watt = Annotated[float, Bounds(ge=0.1, le=1e7)]
 
 GAIN_STD_FRACTION, OFFSET_STD_AMP = 0.02, 0.2
-"""σ of gain and zero [A] of a current sensor where nothing better is known: those of open-loop Hall sensors (Allegro ACS712, 20 A, data
-sheet: total output error ± 1.5 %; its zero drifts by 3.4 mA per kelvin, 0.14 A over 40 K), and half as much again."""
+"""σ of gain and zero [A] of a current sensor without better knowledge: those of open-loop Hall sensors (Allegro ACS712,
+20 A, data sheet: total output error ± 1.5 %; its zero drifts by 3.4 mA per kelvin, 0.14 A over 40 K), times 1.5."""
 
 OFFSET_STD_WATT = 5.0
 """σ of the zero of a power without voltage [W]: that of a current at 24 V."""
 NOMINAL_STD_FRACTION = 0.1
-"""σ of an assumed voltage, as a fraction: a battery of lead falls by 20 % of its nominal voltage, one of lithium by 25 %."""
+"""Relative σ of an assumed voltage [1]: lead batteries fall by 20 % of the nominal voltage, lithium by 25 %."""
 
 TORQUE_GAIN_STD_FRACTION, LOSS_STD_FRACTION = 0.1, 0.3
-"""σ of the gain of torques, which most drivers compute from the motor current with a nominal torque constant (data sheets: ± 10 %), and of
-a stated loss: copper's resistance rises by 0.39 % a kelvin."""
+"""Relative σ [1] of the gain of torques, which most drivers compute from the motor current with a nominal torque
+constant (data sheets: ± 10 %), and of a stated loss: copper's resistance rises by 0.39 % a kelvin."""
 
 TABLE_POWER = "tcpipe/msg/TablePower"
 """The type of a table of power, where that is neither a voltage nor a current as it stands."""
@@ -47,8 +47,9 @@ UNMEASURED_AMP = {
     "battery_status": (-1.0,),
     "": (0.0, 1.0, 1e-3, *(limit / 10**digits for limit in (32767, 32768, 65535) for digits in range(4))),
 }
-"""Currents [A] that mean "not measured", by message: PX4 defines -1. In all others (""), -1 and the limits of 16-bit registers, of either
-sign, may be real: they count only where both neighbours are far. NaN, and a voltage of 0 V or less, are never a measurement."""
+"""Currents [A] that mean "not measured", by message: PX4 defines -1. In all others (""), -1 and the limits of 16-bit
+registers, of either sign, may be real: they count only if both neighbours are far. NaN, and a voltage of 0 V or less,
+are never a measurement."""
 
 GENERIC = "generic"
 """The name of a robot of which nothing is known."""
@@ -57,8 +58,8 @@ MAX_PLAUSIBLE_MPS = 15.0
 """No ground robot that records terrain costs is faster [m/s]: a faster track is an estimate that went astray."""
 
 KNOWN_ENERGY = "e-scooter 36 to 146, Husky 170 to 340, Warthog 440 to 810 J/m"
-"""Energy per metre of known robots: 51 trips of e-scooters (SFIEssential/DualEMobilityData), a simulated Husky, and Warthogs on grass and
-snow (norlab-ulaval/DRIVE, fomo-sdk)."""
+"""Energy per metre of known robots: 51 trips of e-scooters (SFIEssential/DualEMobilityData), a simulated Husky, and
+Warthogs on grass and snow (norlab-ulaval/DRIVE, fomo-sdk)."""
 
 CurrentSign = Literal["drawn_positive", "drawn_negative", "auto"]
 
@@ -71,8 +72,8 @@ _TYPE = re.compile(r"\w+/msg/\w+")
 class FieldPath:
     """One field of a message that a power source names.
 
-    ``column`` is its column: the dotted name, with ``[]`` behind a list of messages (``drivers[].current``). Of a list ``index`` is the
-    element that is meant, and with ``every`` all are summed. ``sign`` is -1 where it is subtracted.
+    ``column`` is its column: the dotted name, with ``[]`` behind a list of messages (``drivers[].current``). ``index``
+    selects an element of a list; with ``every`` all are summed. ``sign`` is -1 for a subtracted field.
     """
 
     column: str
@@ -96,9 +97,9 @@ class Robot:
     voltage_range_volt: tuple[Volt, Volt] | None = None
     """Lowest and highest voltage of the battery [V]; segments outside are flagged."""
     mass_kg: Mass | None = None
-    """Mass while driving, with its load [kg]; with it the power on slopes shows whether the scale of the power is possible."""
+    """Mass while driving, with load [kg]; with it the power on slopes shows whether the power's scale is possible."""
     power_range_watt: tuple[Watt, Watt] | None = None
-    """Lowest and highest median power while driving that was measured on this model, widened by a factor of three [W]."""
+    """Range of the median power while driving, measured on this model and widened by a factor of three [W]."""
     platform: str | None = None
     """Platform code that power sources refer to (Clearpath's, as A200)."""
     status_types: list[str] = field(default_factory=list)
@@ -118,8 +119,8 @@ class Robot:
 class PowerSource:
     """One power rail in a message type: a voltage and the current that drives the wheels at it. Use one table per rail.
 
-    Fields are named by dotted path; ``volts[0]`` is an element of a list, ``drivers[0].amps`` a field of a message in a list,
-    ``drivers[].amps`` the sum over all of them; ``left + right - spare`` is a sum of fields.
+    Fields are named by dotted path; ``volts[0]`` is an element of a list, ``drivers[0].amps`` a field of a message in a
+    list, ``drivers[].amps`` the sum over all of them; ``left + right - spare`` is a sum of fields.
     """
 
     type: str
@@ -189,9 +190,9 @@ class PowerSource:
     husky_power: Literal["battery", "drivers"] | None = None
     """Only with this value of `read.husky_power`."""
     currents_listed: Annotated[int, Bounds(ge=1, le=1000)] | None = None
-    """Number of currents in the list of the message, if its definition states it; messages of another length are rejected."""
+    """Number of currents in the message's list, if its definition states it; other lengths are rejected."""
     wraps_amp: Annotated[float, Bounds(ge=1, le=1e9)] | None = None
-    """A current above half of this is a negative one read as unsigned [A]; if omitted, tcpipe infers it from the data."""
+    """Currents above half of this are negative ones read as unsigned [A]; if omitted, inferred from the data."""
 
     @property
     def lacks_voltage(self) -> bool:
@@ -240,7 +241,7 @@ class Profiles:
     power_sources: list[PowerSource] = field(default_factory=list)
 
     def types(self, *, propulsion: bool = False) -> list[str]:
-        """Return the message types that carry power, best first; with ``propulsion`` those that measure it separately for some robot."""
+        """Return message types with power, best first; with ``propulsion`` those that measure it separately."""
         return list(
             dict.fromkeys(
                 source.type

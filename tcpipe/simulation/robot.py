@@ -1,7 +1,8 @@
-"""The abilities and costs of the simulated robot: speed limits, slip, rolling resistance, grade, battery, and what its wheels meet.
+"""Abilities and costs of the simulated robot: speed limits, slip, rolling resistance, grade, battery, wheel bumps.
 
-The plant is deliberately plain, but every effect that a label should carry is in it: the terrain slows a robot that is commanded at full
-speed, rolling resistance depends on the class (and on what no map shows), grade costs and gives back, turning scrubs, the battery sags.
+The plant is simple, but contains every effect that a label should contain: the terrain slows a robot that is commanded
+at full speed, rolling resistance depends on the class (and on properties that no map shows), grade costs and gives
+back, turning scrubs, the battery sags.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ class SimulatedRobot:
         return table
 
     def speed_factor(self, flat_speed: Floats, sin_slope: Floats) -> Floats:
-        """Return wheel speed over commanded speed, from the class's flat value and the sine of the slope along travel."""
+        """Return wheel speed over commanded speed, from the class's flat value and the slope's sine along travel."""
         return flat_speed * (1.0 - self.uphill_slowdown * np.maximum(sin_slope, 0.0) / _STEEPEST_SIN)
 
     def slip(self, flat_slip: Floats, sin_slope: Floats) -> Floats:
@@ -130,11 +131,12 @@ def drive_along(  # noqa: PLR0917 - numba takes positional arguments
     grid_m: float, speed_factor: Floats, slip: Floats, map_per_surface: Floats, command_mps: float, brake_at_m: float,
     time_constant_s: float, max_acceleration_mps2: float, dt_s: float, max_steps: int,
 ) -> tuple[Floats, Floats, int]:  # fmt: skip
-    """Drive one path from rest to rest; returns path position [m], wheel speed [m/s] at every step, and the number of steps.
+    """Drive a path from rest to rest; return path position [m] and wheel speed [m/s] by step, and the step count.
 
-    The arrays hold the ground along the path every ``grid_m`` map metres. Wheel speed follows command times ``speed_factor`` with a
-    first-order lag and a limited acceleration; past ``brake_at_m`` the command is zero. Ends when the wheels stand, or, with the
-    position past the path, when the path was too short to stop on (the caller checks).
+    The arrays describe the ground along the path every ``grid_m`` map metres. Wheel speed follows command times
+    ``speed_factor`` with a first-order lag and a limited acceleration; past ``brake_at_m`` the command is zero. Ends
+    when the wheels stop, or, with the position past the path, when the path was too short to stop on (the caller
+    checks).
     """
     position, wheel = np.empty(max_steps), np.empty(max_steps)
     s, w, last = 0.0, 0.0, speed_factor.size - 1
@@ -160,7 +162,7 @@ def drive_along(  # noqa: PLR0917 - numba takes positional arguments
 
 @compile_kernel
 def make_correlated_noise(white: Floats, correlation: float) -> Floats:
-    """Return a first-order Gauss-Markov series of unit variance from white noise; ``correlation`` is that of neighbours."""
+    """Return a first-order Gauss-Markov series of unit variance; ``correlation``: of neighbours; ``white``: noise."""
     out, gain = white.copy(), np.sqrt(1.0 - correlation * correlation)
     for i in range(1, white.size):
         out[i] = correlation * out[i - 1] + gain * white[i]

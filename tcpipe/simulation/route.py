@@ -1,10 +1,10 @@
 """Plans of simulated drives, and the truth of driving them over a world.
 
-A plan is a list of manoeuvres. A `Leg` starts at the robot's pose, after a turn in place if necessary; its corners become arcs, its
-curvature is smoothed over 0.5 m, and sideways weaving of a human driver is added.
+A plan is a list of manoeuvres. A `Leg` starts at the robot's pose, after a turn in place if necessary; its corners
+become arcs, its curvature is smoothed over 0.5 m, and sideways weaving of a human driver is added.
 
-Time runs at 200 Hz. Along a leg only position on the path and wheel speed are integrated (`robot.drive_along`); pose, ground distance
-and power follow exactly from the surface, the projection and the robot model.
+Time runs at 200 Hz. Along a leg only position on the path and wheel speed are integrated (`robot.drive_along`); pose,
+ground distance and power follow exactly from the surface, the projection and the robot model.
 """
 
 from __future__ import annotations
@@ -231,7 +231,7 @@ class Wander:
     def _next(
         self, world: World, rng: np.random.Generator, here: Floats, direction: float | None, done: Floats
     ) -> Floats | None:
-        """Choose the best of many random next waypoints, and count its classes into ``done``; None if none is allowed."""
+        """Return the best of many random waypoints, with its classes counted in ``done``; None if none is allowed."""
         count, points = 192, 40
         turn = rng.normal(0.0, 0.6, count) if direction is not None else rng.uniform(-np.pi, np.pi, count)
         turn = np.clip(turn, -1.9, 1.9) if direction is not None else turn
@@ -254,7 +254,7 @@ class Wander:
         return np.array([u[best, -1], v[best, -1]])
 
     def _allowed(self, world: World, u: Floats, v: Floats) -> tuple[Mask, Bytes, Floats]:
-        """Return which lines may be driven, the classes along them, and how steep they are on the whole (1: the steepest allowed)."""
+        """Return which lines may be driven, their classes, and their overall steepness (1: the steepest allowed)."""
         site, margin = world.site, self.margin_m
         west, east = self.x_range_m or (margin, site.width_m - margin)
         inside = (u > west) & (u < east) & (v > margin) & (v < site.height_m - margin)
@@ -276,7 +276,7 @@ _DIGGING_RESISTANCE = 0.3
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """One manoeuvre, sampled: position in the map from the site's corner, direction in the map, wheel speed, slip, commands."""
+    """One manoeuvre, sampled: position from the map corner and direction in the map, wheel speed, slip, commands."""
 
     uv_m: Floats
     yaw_map_rad: Floats
@@ -376,11 +376,13 @@ def _drive_path(world: World, path: Path, command: float, robot: SimulatedRobot,
     brake_at_m = max(path.stop_m - _BRAKE_BEFORE_M * command, 0.1)
     s, wheel, steps = drive_along(
         PATH_GRID_M, speed_factor, slip, np.cos(slope) / scale, command_mps, brake_at_m,
-        robot.speed_time_constant_s, robot.max_acceleration_mps2, _DT_S, int(path.length_m / (0.2 * command_mps * _DT_S)),
+        robot.speed_time_constant_s, robot.max_acceleration_mps2, _DT_S,
+        int(path.length_m / (0.2 * command_mps * _DT_S)),
     )  # fmt: skip
     if wheel[-1] > 0.0 or s[-1] > grid[-1]:
         raise UsageError(
-            f"simulated drive: the robot does not stop on a leg of {path.length_m:.1f} m ({steps} steps); make it longer"
+            f"simulated drive: the robot does not stop on a leg of {path.length_m:.1f} m ({steps} steps); make it "
+            "longer"
         )
     uv, direction = path.at(s)
     sign = -1.0 if backwards else 1.0

@@ -1,6 +1,6 @@
 """Scenarios of `tcpipe simulate`: a world, drives over it, their sensors and faults, and how the rasters are cut.
 
-The paper's site follows the paper as far as this describes it: ``paper_site.toml`` has its numbers, each with its source.
+The paper's site follows the paper as far as described there: ``paper_site.toml`` has its numbers, each with its source.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ HUSKY_ROS2 = Recorder("ros2", "clearpath_power")
 HUSKY_ROS1 = Recorder("ros1", "husky_status")
 
 Container = Literal["mcap", "bag", "rosbag2", "rosbag2_mcap"]
-"""ROS 2 or, with the ROS 1 recorder, ROS 1 messages in MCAP; a ROS 1 bag; ROS 2 bag directories with sqlite3 or MCAP."""
+"""ROS 2 messages in MCAP (ROS 1 with the ROS 1 recorder); ROS 1 bag; ROS 2 bag directories with sqlite3 or MCAP."""
 
 _WEST = ((1.0, 1.0), (80.0, 2.0), (74.0, 40.0), (80.0, 79.0), (2.0, 78.0))
 """Two thirds of the small world, with a bent border."""
@@ -160,7 +160,7 @@ def _drop_sources(table: Numbers) -> Numbers:
 
 
 def make_paper_site() -> PaperSite:
-    """Return a site as large, as high and as steep as the paper's (section IV-A), its robot, and drives with its class shares."""
+    """Return a site of the paper's size, heights, slopes (section IV-A), its robot, and drives by its class shares."""
     parameters = read_paper_parameters()
     ground = {_GROUNDS[name]: GroundModel(**table) for name, table in parameters["ground"].items()}
     robot = SimulatedRobot(**parameters["robot"], ground=ground, wheels=Wheels(**parameters["wheels"]))
@@ -213,9 +213,10 @@ _PAPER_ROADS = (
 
 
 def make_paper_world() -> World:
-    """Return a site as large, as high and as steep as the paper's (section IV-A): 596 m × 305 m, 574.8 m to 661.3 m above sea level.
+    """Return a site of the paper's extent and heights (section IV-A): 596 m × 305 m, 574.8 m to 661.3 m high.
 
-    Its shape is made up: a long slope with knolls, two paved and three unpaved roads, mud in the hollows, trees and hedges.
+    Its shape is invented: a long slope with knolls, two paved and three unpaved roads, mud in the hollows, trees and
+    hedges.
     """
     parameters = read_paper_parameters()
     about, surface = parameters["site"], parameters["surface"]
@@ -227,7 +228,8 @@ def make_paper_world() -> World:
     plants = tuple(
         Ellipse(class_id, *place)
         for class_id, name, size_m, margin_m in (
-            (MUD, "mud_patches", (5.0, 13.0), 25.0), (VEGETATION, "hedges", (3.0, 14.0), 0.0), (TREE, "trees", (1.5, 4.5), 0.0),
+            (MUD, "mud_patches", (5.0, 13.0), 25.0), (VEGETATION, "hedges", (3.0, 14.0), 0.0),
+            (TREE, "trees", (1.5, 4.5), 0.0),
         )
         for place in _scatter_places(site, rng, about[name], size_m=size_m, margin_m=margin_m)
     )  # fmt: skip
@@ -288,13 +290,14 @@ def _make_paper() -> Scenario:
 
 
 def _make_paper_quick() -> Scenario:
-    """Return the paper's robot and sensors on the small world for some minutes, with coarse rasters: to see everything run."""
+    """Return the paper's robot and sensors on the small world for some minutes, with coarse rasters."""
     site = make_paper_site()
     starts = ((14.0, 34.0), (40.0, 60.0), (110.0, 30.0))
     drives = tuple(
         DriveSpec(
             f"quick_{number}", Wander(190.0, start, odd_manoeuvres=False), start, "mcap", HUSKY_ROS2, site.sensors,
-            Faults.only("gnss_noise", "wheel_slip", "wheel_noise", "imu_noise", "visual_noise", "power_noise"), site.robot,
+            Faults.only("gnss_noise", "wheel_slip", "wheel_noise", "imu_noise", "visual_noise", "power_noise"),
+            site.robot,
         )
         for number, start in enumerate(starts, 1)
     )  # fmt: skip
@@ -345,7 +348,8 @@ def make_tiny(
 
 def _make_manoeuvres() -> Scenario:
     plan = (
-        Pause(3.0), Leg(((30.0, 34.0),)), Pause(1.0), Turn(np.pi / 2), Turn(-np.pi), Pause(0.5), Reverse(3.0), Pause(0.5),
+        Pause(3.0), Leg(((30.0, 34.0),)), Pause(1.0), Turn(np.pi / 2), Turn(-np.pi), Pause(0.5), Reverse(3.0),
+        Pause(0.5),
         Leg(((36.0, 44.0), (30.0, 50.0)), radius_m=1.2), Stuck(3.0), Leg(((20.0, 56.0),), command=0.5), Pause(2.0),
     )  # fmt: skip
     drive = DriveSpec("manoeuvres", plan, (14.0, 34.0))
@@ -360,9 +364,9 @@ SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
     "tiny": make_tiny,
     "manoeuvres": _make_manoeuvres,
 }
-"""Scenarios by name: demo (two drives of four minutes), hills12 (twelve minutes, all faults), paper (eleven drives of 0.5 km to 1.5 km
-over a site of the paper's size), paper_quick (three short ones of the same robot), tiny (half a minute), manoeuvres (one of each, no
-faults)."""
+"""Scenarios by name: demo (two drives of four minutes), hills12 (twelve minutes, all faults), paper (eleven drives of
+0.5 km to 1.5 km over a site of the paper's size), paper_quick (three short ones of the same robot), tiny (half a
+minute), manoeuvres (one of each, no faults)."""
 
 
 def find_scenario(name: str) -> Scenario:

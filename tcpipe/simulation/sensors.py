@@ -1,7 +1,8 @@
-"""The simulated sensors: what each would have measured of the truth, and when the recorder received it.
+"""Simulated sensors: what each measures of the truth, and when the recorder receives it.
 
-A sensor samples at its own rate and phase. Its reading contains the time of measurement in the header, the time of recording, and
-columns in SI units in the sensor's own frame. Each sensor and each fault draws from a random stream of its own, named by a string.
+A sensor samples at its own rate and phase. Its reading contains the time of measurement in the header, the time of
+recording, and columns in SI units in the sensor's own frame. Each sensor and each fault draws from its own random
+stream, named by a string.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ class Gnss:
     std_m: float = 0.005  # white, east and north
     vertical_std_m: float = 0.0085
     lasting_std_m: tuple[float, float] = (0.008, 0.020)
-    """Range of the part that is correlated in time, east and north; each drive draws one. (0, 0): all noise is white."""
+    """Range of σ of the time-correlated part, east and north; each drive draws one. (0, 0): all noise is white."""
     lasts_s: tuple[float, float] = (5.0, 60.0)  # range of its correlation time, of which each drive draws one
     covariance: Literal["known", "unknown"] = "known"  # whether the message states its standard deviation
     mounting: Mounting = Mounting((0.1, 0.0, 0.9))
@@ -241,7 +242,7 @@ class Sensors:
 
 
 def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: Noise) -> dict[str, Reading]:
-    """Return what all sensors said of a drive, by sensor (gnss, imu, wheels, visual, power, command, doppler); ``sensors`` as mounted."""
+    """Return a drive's readings by sensor (gnss, imu, wheels, visual, power, command, doppler), as mounted."""
     readers: dict[str, Callable[..., Reading]] = {
         "gnss": partial(read_gnss, site=site), "imu": read_imu, "wheels": read_wheels, "visual": read_visual,
         "power": read_power_meters, "command": read_joystick, "doppler": read_doppler,
@@ -354,7 +355,7 @@ def read_wheels(truth: Truth, sensor: WheelOdometry, faults: Faults, noise: Nois
 
 
 def read_imu(truth: Truth, sensor: Imu, faults: Faults, noise: Noise) -> Reading:
-    """Return angular_velocity_radps and specific_force_mps2, (N, 3) in the unit's frame, and orientation_xyzw of the unit in ENU."""
+    """Return angular_velocity_radps, specific_force_mps2, (N, 3), in the unit's frame, and orientation_xyzw in ENU."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("imu.phase"))
     at = truth.at(stamp)
     place = truth.enu_m + rotate(truth.quat_xyzw, np.array(sensor.mounting.xyz_m))
@@ -386,7 +387,7 @@ def read_imu(truth: Truth, sensor: Imu, faults: Faults, noise: Noise) -> Reading
 
 
 def read_visual(truth: Truth, sensor: Visual, faults: Faults, noise: Noise) -> Reading:
-    """Return twist (linear and angular, (N, 3) each, in the camera's frame) and the camera's pose in its own odometry frame."""
+    """Return the twist (linear, angular, (N, 3) each, camera frame) and the camera's pose in its odometry frame."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("visual.phase"))
     at = truth.at(stamp)
     base_from_camera = sensor.mounting.quat_xyzw()
@@ -455,7 +456,7 @@ def _finish(
     stamp: Ints, delay_s: float, values: Values, faults: Faults, noise: Noise, *,
     name: str, keep: Mask | None = None,
 ) -> Reading:  # fmt: skip
-    """Return what is recorded: messages late by a delay with an exponential tail, without those not kept, some of them twice."""
+    """Return the recorded messages: with exponential tail delays, without lost ones, with some of them twice."""
     times = np.ones(stamp.size, np.int64) if keep is None else keep.astype(np.int64)
     log_time = stamp
     if faults.transport_delay:
@@ -496,7 +497,7 @@ def _interpolate(values: Floats, truth: Truth, stamp: Ints) -> Floats:
 
 
 def _make_wandering_bias(stamp: Ints, size: float, rng: np.random.Generator) -> Floats:
-    """Return a constant of about ``size`` per axis that drifts by a fifth of it with a correlation time of 100 s, shape (N, 3)."""
+    """Return a constant of about ``size`` an axis that drifts by a fifth, correlated over 100 s, shape (N, 3)."""
     constant = size * np.sign(rng.standard_normal(3)) * rng.uniform(0.6, 1.2, 3)
     step_s = float(np.median(np.diff(stamp))) * 1e-9
     return constant + 0.2 * size * _make_lasting_noise(stamp.size, step_s / 100.0, rng)

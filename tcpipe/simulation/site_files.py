@@ -49,7 +49,7 @@ class SimulatedSite:
 
 
 def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> SimulatedSite:
-    """Write a simulated site to ``out``, whole or not at all: the same scenario and seed give the same bytes. An identical site is kept.
+    """Write a simulated site to ``out``, whole or not at all, unless it exists; bytes follow from scenario and seed.
 
     Raises `UsageError`: the scenario is unknown, or ``out`` holds something else.
     """

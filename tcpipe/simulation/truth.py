@@ -25,7 +25,8 @@ _COMPONENTS = {
 class Truth:
     """One drive at 200 Hz; all arrays have one row a step, and base_link stands on the ground.
 
-    The local plane is east, north, up of the site's datum; ``quat_xyzw`` is enu_from_base_link; velocities are of base_link.
+    The local plane is east, north, up of the site's ENU origin; ``quat_xyzw``: enu_from_base_link; velocities are of
+    base_link.
     """
 
     stamp_ns: Ints
@@ -78,7 +79,7 @@ class Truth:
         )
 
     def table(self) -> pa.Table:
-        """Return one row a step; what has several components becomes several columns, and roll, pitch, yaw are added."""
+        """Return one row a step, with a column for each component, and roll, pitch, yaw added."""
         flat = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _COMPONENTS}
         for name, columns in _COMPONENTS.items():
             flat |= dict(zip(columns, getattr(self, name).T, strict=True))
@@ -109,9 +110,9 @@ class TrueCost:
 
 
 def compute_true_cost(truth: Truth, start_ns: Ints, chord_m: float = 1.0) -> TrueCost:
-    """Return what the metre cost that begins where the robot truly was at ``start_ns``, shape (N,).
+    """Return the cost of the metre that begins at the robot's true position at ``start_ns``, shape (N,).
 
-    It ends at the first crossing of the horizontal distance ``chord_m`` from there, found within a step by linear motion.
+    It ends at the first crossing of the horizontal distance ``chord_m`` from there, with linear motion within a step.
     """
     seconds = (truth.stamp_ns - truth.stamp_ns[0]) * 1e-9
     start = (np.asarray(start_ns, dtype=np.int64) - truth.stamp_ns[0]) * 1e-9

@@ -1,8 +1,9 @@
-"""A world that is known exactly at every point: place on Earth, height, slope, terrain class, colour, and what its ground costs.
+"""A world known exactly at every point: position on Earth, height, slope, terrain class, colour, and cost of ground.
 
-Height is a sum of smooth hills and waves, classes are bands (roads) and ellipses (mud, trees, a pond) on grass, colour follows the class
-with soft borders and a band-limited texture. Every function takes map coordinates of any shapes that broadcast; hills are separable,
-so that a raster costs an outer product. Classes are the ids of `tcpipe.terrain.layers.PAPER_CLASSES`; the last four are traversable.
+Height is a sum of smooth hills and waves, classes are bands (roads) and ellipses (mud, trees, a pond) on grass, colour
+follows the class with soft borders and a band-limited texture. Every function takes map coordinates of any shapes that
+broadcast; hills are separable, so that a raster costs an outer product. Classes are the ids of
+`tcpipe.terrain.layers.PAPER_CLASSES`; the last four are traversable.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ _STEP_M = 10.0
 class Site:
     """A rectangle of a projected CRS, and the height of the geoid over the ellipsoid there.
 
-    A map metre is no ground metre, and grid north is not north: both follow from pyproj's projection by differences, without any formula
-    of the pipeline, so that the truth is independent of what it judges.
+    A map metre differs from a ground metre, and grid north from true north: both follow from differences of pyproj's
+    projection, without any formula of the pipeline, so that the truth is independent of it.
 
-    The default lies at 17.6° E, 47° N in UTM zone 33, where grid north is 1.9° off true north.
+    The default site is at 17.6° E, 47° N in UTM zone 33, where grid north is 1.9° off true north.
     """
 
     epsg: int = 32633
@@ -46,14 +47,17 @@ class Site:
 
     @cached_property
     def datum(self) -> tuple[float, float, float]:
-        """Origin of the local plane: longitude [deg], latitude [deg], ellipsoidal height [m] (the site's middle, at the geoid)."""
+        """Origin of the local plane: longitude, latitude [deg], ellipsoidal height [m] (middle of the site, geoid)."""
         lon, lat = self._to_wgs84.transform(self.west_m + self.width_m / 2, self.south_m + self.height_m / 2)
         return float(lon), float(lat), self.geoid_m
 
     @cached_property
     def _to_enu(self) -> Transformer:
         lon, lat, alt = self.datum
-        steps = f"+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 +lon_0={lon!r} +lat_0={lat!r} +h_0={alt!r}"
+        steps = (
+            "+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
+            f"+lon_0={lon!r} +lat_0={lat!r} +h_0={alt!r}"
+        )
         return Transformer.from_pipeline(f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad {steps}")
 
     def lonlat_deg(self, x_map_m: Floats, y_map_m: Floats) -> tuple[Floats, Floats]:
@@ -109,7 +113,7 @@ def draw_waves(
     wavelength_m: tuple[float, float],
     direction_rad: tuple[float, float] = (0.0, np.pi),
 ) -> tuple[Wave, ...]:
-    """Return plane waves of random direction and phase, log-uniform wavelength, and amplitudes that sum in square to ``total``²."""
+    """Return plane waves of random direction, phase, log-uniform wavelength; squared amplitudes sum to ``total``²."""
     rng = np.random.default_rng(seed)
     amplitude = total * np.sqrt(2.0 / count)
     ranges = (*np.log(wavelength_m),), direction_rad, (0.0, 2.0 * np.pi)
@@ -313,7 +317,7 @@ class World:
         return total + sum_waves(self.waves, u, v)
 
     def mapped_height_m(self, x_map_m: Floats, y_map_m: Floats) -> Floats:
-        """Return the height that a raster holds: with bumps and ridges, which wheels feel and the pose does not, and the map's noise."""
+        """Return a raster's height: with map noise, and bumps and ridges that affect wheels but not the pose."""
         height = self.height_m(x_map_m, y_map_m)
         if self.surface is None:
             return height
@@ -370,7 +374,7 @@ class World:
         return inside
 
     def resistance_factor(self, x_map_m: Floats, y_map_m: Floats) -> Floats:
-        """Return what the class's rolling resistance is multiplied with here: what the orthophoto shows, and what nothing does."""
+        """Return the factor on the class's rolling resistance: a part that the orthophoto shows, and a hidden part."""
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         hidden = sum_waves(self.resistance, u, v)
         if self.surface is None:

@@ -1,1 +1,1 @@
-"""Splits: regions with a buffer, holdouts by rank of a hash, row order, and the leakage audit, all in the map's plane."""
+"""Splits: regions with a buffer, holdouts by rank of a hash, row order, and the leakage audit, in the map's plane."""

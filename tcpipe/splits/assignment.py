@@ -1,7 +1,8 @@
 """The split and the fold of every sample, from its footprint, its run and its id (docs/explanation/rulings.md, Split).
 
-A dataset grows, and a test sample must never become a training sample. So the draw of groups replays the arrival of the data: run by run,
-in the order of recording, groups may join test and none leaves it. Later runs cannot undo what earlier ones decided.
+A dataset grows, and a test sample must never become a training sample. So the draw of groups replays the arrival of the
+data: run by run, in the order of recording, groups may join test and none leaves it. Later runs do not change earlier
+decisions.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Groups:
 
 
 def assign_blocks(corners_xy_m: Floats, rows: Ints, *, block_m: float) -> Groups:
-    """Return the spatial block of the centre of footprints ``rows``: square cells of ``block_m`` [m] on the plane's own origin."""
+    """Return the block of the centres of footprints ``rows``: squares of ``block_m`` [m] from the plane's origin."""
     codes = np.empty(len(rows), np.int64)
     for first in range(0, len(rows), _CHUNK):
         part = slice(first, first + _CHUNK)
@@ -67,7 +68,7 @@ def assign_blocks(corners_xy_m: Floats, rows: Ints, *, block_m: float) -> Groups
 
 
 def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: float) -> Mask:
-    """Mark ceil(test_fraction · n) samples as test, shape (N,): of every arrival those of lowest rank, to make up the share so far.
+    """Mark ceil(test_fraction · n) samples as test, shape (N,): the lowest ranks of each arrival, up to its share.
 
     A later arrival moves no earlier sample; one in between changes every later arrival by at most one sample.
 
@@ -89,8 +90,8 @@ def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: flo
 def draw_groups(groups: Groups, arrival: Ints, *, test_fraction: float, seed: int) -> NDArray[np.bool_]:
     """Mark whole groups as test, shape (G,), nearest to a share ``test_fraction`` of the samples.
 
-    After each arrival the groups so far are visited by rank; a training group joins test if that brings the share nearer to
-    ``test_fraction``. Two or more groups always leave something to test and to train; a single group trains.
+    After each arrival the groups so far are visited by rank; a training group joins test if that brings the share
+    nearer to ``test_fraction``. Two or more groups always leave samples to test and to train; a single group trains.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ def draw_groups(groups: Groups, arrival: Ints, *, test_fraction: float, seed: in
 
 
 def _take(tests: Mask, free: Ints, sizes: Ints, *, wanted: float) -> None:
-    """Add groups in ``free``, which are sorted by rank, to ``tests`` while that brings their share nearer to ``wanted``."""
+    """Add groups in ``free``, sorted by rank, to ``tests`` while that brings their share nearer to ``wanted``."""
     has_samples = sizes > 0
     taken, left = int(sizes[tests].sum()), int((has_samples & ~tests).sum())
     for group in free[~tests[free]].tolist():
@@ -222,10 +223,10 @@ def assign_splits(
 
 
 def hash_ranks(names: Sequence[str], *, seed: int, purpose: str) -> Ranks:
-    """Return a rank for each name, uniform over 64 bits, shape (N,): the same on every machine, whatever other names there are.
+    """Return a rank for each name, uniform over 64 bits, shape (N,), independent of machine and other names.
 
-    It is the first 8 bytes, big-endian, of blake2b over ``seed:name`` with ``purpose`` as person string: ranks for two purposes are
-    independent, so that the row order does not depend on the holdout.
+    It is the first 8 bytes, big-endian, of blake2b over ``seed:name`` with ``purpose`` as person string: ranks for two
+    purposes are independent, so that the row order does not depend on the holdout.
     """
     person = purpose.encode()[:16]
     digests = b"".join(blake2b(f"{seed}:{name}".encode(), digest_size=8, person=person).digest() for name in names)

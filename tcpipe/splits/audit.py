@@ -1,4 +1,4 @@
-"""The leakage audit: ground that test and unseen samples share with training, by near pairs of footprints in one metric plane."""
+"""Leakage audit: ground that test and unseen samples share with training, by near pairs of footprints in one plane."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _M_A_DEG = 111_195.0  # of a great circle: to half a per cent
 def audit_leakage(
     train: Mask, held: Mapping[str, Mask], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
 ) -> tuple[HeldOut, ...]:
-    """Return, for each split that is ``held`` out, how much ground and how many neighbours its samples share with train.
+    """Return, for each split in ``held``, how much ground and how many neighbours its samples share with train.
 
     Parameters
     ----------
@@ -130,14 +130,14 @@ def are_near(queries: Floats, references: Floats, *, within_m: float, in_degrees
 
 
 def find_near_pairs(queries_xy_m: Floats, tree: cKDTree, *, within_m: float) -> tuple[Ints, Ints]:
-    """Return index pairs of ``queries``, shape (N, 2), and points of a tree that are at most ``within_m`` apart [m], in order."""
+    """Return index pairs of ``queries``, (N, 2), and points of a tree at most ``within_m`` [m] apart, in order."""
     found = cKDTree(queries_xy_m).sparse_distance_matrix(tree, within_m, output_type="ndarray")
     order = np.lexsort((found["j"], found["i"]))
     return found["i"][order], found["j"][order]
 
 
 def compute_shared_fraction(queries: Floats, references: Floats, i: Ints, j: Ints) -> Floats:
-    """Return the share of the ground of ``queries[i]`` that ``references[j]`` covers too, (P,); corners in order around, (N, 4, 2)."""
+    """Return the share of ``queries[i]`` that ``references[j]`` covers, (P,); ordered corners, shape (N, 4, 2)."""
     ours, shared_m2 = shapely.polygons(queries), np.empty(len(i))
     for first in range(0, len(i), _PAIRS):
         part = slice(first, first + _PAIRS)
@@ -147,7 +147,7 @@ def compute_shared_fraction(queries: Floats, references: Floats, i: Ints, j: Int
 
 
 def compute_nearest_m(queries: Floats, ground: Footprints) -> Floats:
-    """Return the distance from each of ``queries``, corners (N, 4, 2), to the nearest of the ground [m], (N,); empty if either is."""
+    """Return the distance of ``queries``, corners (N, 4, 2), to the nearest ground [m], (N,); empty if one is."""
     count = len(ground.rows)
     if len(queries) == 0 or count == 0:
         return np.empty(0)

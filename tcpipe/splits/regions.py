@@ -1,7 +1,7 @@
-"""Regions of a split and the side on which each patch footprint lies (paper section IV-C; docs/explanation/rulings.md, Split).
+"""Regions of a split, and the side of each patch footprint (paper section IV-C; docs/explanation/rulings.md, Split).
 
-A footprint belongs to a region only if the whole rotated square is inside; one that straddles a border, or is nearer to it
-than the buffer, belongs to none. What no region covers is unseen.
+A footprint belongs to a region only if the whole rotated square is inside; one that straddles a border, or is nearer to
+it than the buffer, belongs to none. Ground outside all regions is unseen.
 """
 
 from __future__ import annotations

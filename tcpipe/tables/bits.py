@@ -29,7 +29,7 @@ class DropReason(IntFlag):
     REVERSING = 1 << 4
     """Driving backwards."""
     ACCELERATING = 1 << 5
-    """Change of the commanded speed (2 s after it); without commands: |dv/dt| > 0.3 m/s² for 0.2 s; start, stop."""
+    """Commanded change of speed (and 2 s after it), else |dv/dt| > 0.3 m/s² for 0.2 s; start and stop ramps."""
     BELOW_FULL_SPEED = 1 << 6
     """Commanded below 0.95 of the robot's maximum: the terrain does not limit the speed."""
     TIME_WINDOW = 1 << 7

@@ -124,7 +124,7 @@ SubjectKind: TypeAlias = Literal[
 
 
 def omit(default: object = None) -> Any:
-    """Return a field with a default that is no key of the JSON object while it has its default; a collection, while it is empty."""
+    """Return a field that the JSON object omits while it has its default (a collection: while it is empty)."""
     omitted = (None, {}, [], ()) if default in ({}, [], ()) else (default,)
     if isinstance(default, dict | list):
         return field(default_factory=type(default), metadata={"json": omitted})
