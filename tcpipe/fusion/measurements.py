@@ -12,7 +12,7 @@ the `Measurements` of a section, its `InitialState` and the wanted stamps, incre
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
@@ -333,10 +333,10 @@ class TrackSection:
     measurements: Measurements
 
 
-def cut_sections(measurements: Mapping[int, Measurements]) -> list[TrackSection]:
+def cut_sections(measurements: Mapping[int, Measurements], cuts_ns: Sequence[int] = ()) -> list[TrackSection]:
     """Return the sections of measurements given by clock epoch, in order of epoch and time; those without motion are left out.
 
-    A section ends at a pause.
+    A section ends at a pause, and before each of the stamps ``cuts_ns`` of a measurement.
     """
     found = []
     for epoch in sorted(measurements):
@@ -344,7 +344,7 @@ def cut_sections(measurements: Mapping[int, Measurements]) -> list[TrackSection]
         stamp = _make_stamps(whole, with_imu=True)
         if stamp.size == 0:
             continue
-        pause = np.flatnonzero(np.diff(stamp) > PAUSE_NS)
+        pause = np.flatnonzero((np.diff(stamp) > PAUSE_NS) | np.isin(stamp[1:], cuts_ns))
         first = stamp[np.concatenate(([0], pause + 1))]
         last = stamp[np.concatenate((pause, [stamp.size - 1]))]
         for start, end in zip(first.tolist(), last.tolist(), strict=True):

@@ -79,6 +79,7 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
         *find_parameter_findings(sections, summary, streams),
         *([make_finding("direction-assumed", Subject("role", GNSS))] if fused.is_forward_assumed else []),
         *find_offsets(sections, streams),
+        *sections[0].cuts.values(),
     )
     facts: dict[str, Any] = {
         "fuse": summary,

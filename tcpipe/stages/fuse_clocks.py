@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,8 +14,11 @@ from tcpipe.fusion.checks.clock_offsets import (
     shift_sensors,
 )
 from tcpipe.fusion.checks.sanity import SensorExclusion
+from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
 from tcpipe.fusion.measurements import DOPPLER, GNSS
 from tcpipe.fusion.preparation import inflate_late_fixes
+from tcpipe.fusion.signals import MAX_GAP_NS
+from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_findings import rename_role
@@ -99,7 +102,8 @@ def correct_clocks(sections: Sequence[Section], streams: Streams) -> list[Sectio
             found_s = section.offsets[GNSS].offset_s if GNSS in section.offsets else 0.0
             shifted = replace(shifted, gnss=inflate_late_fixes(shifted.gnss, stated_s + found_s))
         corrected.append(replace(section, measurements=shifted))
-    return corrected
+    cuts = dict(find_clock_jumps(corrected))
+    return [replace(section, cuts=cuts) for section in corrected]
 
 
 def find_offsets(sections: Sequence[Section], streams: Streams) -> list[Finding]:
@@ -134,3 +138,30 @@ def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Rem
     correction_s = round(given_s - offset.offset_s, 3)
     roles = (role, DOPPLER) if role == GNSS and DOPPLER in streams.tables else (role,)
     return suggest("correct", {"read.time_offset_s": dict.fromkeys(roles, correction_s)})
+
+
+def find_clock_jumps(sections: Sequence[Section]) -> Iterator[tuple[int, Finding]]:
+    """Yield the first stamps [ns] after the clock of all sensors was set forward, and the findings.
+
+    Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive meanwhile.
+    """
+    stamps = [sensor.stamp_ns for section in sections for sensor in section.measurements.sensors().values()]
+    for epoch in dict.fromkeys(section.clock_epoch for section in sections):
+        of_epoch = [section.measurements for section in sections if section.clock_epoch == epoch]
+        odometries = [m.first_odometry for m in of_epoch if m.first_odometry is not None]
+        fixes = [m.gnss for m in of_epoch if m.gnss is not None]
+        if not odometries or not fixes:
+            continue
+        wheels_ns, fixes_ns = (np.concatenate([each.stamp_ns for each in of_role]) for of_role in (odometries, fixes))
+        speed_mps = np.concatenate([each.velocity_mps[:, 0] for each in odometries])
+        place_m = np.concatenate([each.position_enu_m[:, :2] for each in fixes])
+        stamp_ns = np.unique(np.concatenate([sensor.stamp_ns for m in of_epoch for sensor in m.sensors().values()]))
+        ends_ns = np.stack((stamp_ns[:-1], stamp_ns[1:]))[:, np.diff(stamp_ns) > MAX_GAP_NS]
+        steps_s = np.diff(ends_ns, axis=0)[0] * 1e-9
+        slowest_mps = np.abs(np.interp(ends_ns, wheels_ns, speed_mps)).min(axis=0)
+        moved_m = np.hypot(*(np.diff(np.interp(ends_ns, fixes_ns, axis), axis=0)[0] for axis in place_m.T))
+        jumps = (slowest_mps > MIN_SPEED_MPS) & (moved_m < 0.5 * slowest_mps * steps_s)
+        for after_ns, step_s in zip(ends_ns[1, jumps].tolist(), steps_s[jumps].tolist(), strict=True):
+            at_s = (after_ns - min(int(each[0]) for each in stamps)) * 1e-9
+            span_s, names = (at_s, at_s), {"topics": "all topics"}
+            yield after_ns, make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s)

@@ -58,6 +58,7 @@ class Section:
     prepared : by role, messages that are not used as they are.
     excluded : by role, why a sensor is not fused.
     clocks : time offsets of the sensors; ``measurements`` contain them until `tcpipe.stages.fuse_clocks.correct_clocks`.
+    cuts : by first stamp [ns] after the clock of all sensors was set forward, the finding.
     """
 
     clock_epoch: int
@@ -68,6 +69,7 @@ class Section:
     findings: tuple[Finding, ...] = ()
     excluded: Mapping[str, Finding] = field(default_factory=dict)
     clocks: ClockFacts = field(default_factory=lambda: ClockFacts(0, "", (), {}))
+    cuts: Mapping[int, Finding] = field(default_factory=dict)
 
     @property
     def span_ns(self) -> tuple[int, int]:

@@ -56,7 +56,7 @@ def fuse_section(section: Section, streams: Streams, config: FuseConfig, last: T
     """Fuse each part of a section between pauses; a local frame goes on from the end of ``last``, the track before it."""
     fused = Fused()
     period_ns, max_gap_ns = round(1e9 / config.rate_hz), int(config.max_gap_s * 1e9)
-    for part in cut_sections({section.clock_epoch: section.measurements}):
+    for part in cut_sections({section.clock_epoch: section.measurements}, tuple(section.cuts)):
         m, output_ns = part.measurements, make_track_stamps(part, period_ns=period_ns, max_gap_ns=max_gap_ns)
         if output_ns.size == 0 or (section.datum_deg_m is not None and m.gnss is None):
             fused.skipped_s += (part.end_ns - part.start_ns) * 1e-9

@@ -242,6 +242,12 @@ def test_epochs_and_long_pauses_cut():
     assert found[2].measurements.gnss.stamp_ns.size == 1
 
 
+def test_a_cut_divides_a_section_before_its_stamp():
+    stamps = np.concatenate((grid(0, 10 * S, S // 10), grid(13 * S, 20 * S, S // 10)))
+    found = cut_sections({0: Measurements(wheels=wheels(stamps))}, [13 * S])
+    assert [(s.start_ns, s.end_ns) for s in found] == [(0, stamps[99]), (13 * S, stamps[-1])]
+
+
 def test_the_imu_bridges_a_pause_but_is_no_motion_by_itself():
     stamps = np.concatenate((grid(0, 10 * S, S // 10), grid(20 * S, 30 * S, S // 10)))
     bridged = Measurements(wheels=wheels(stamps), imu=imu(grid(0, 40 * S, S // 100)))

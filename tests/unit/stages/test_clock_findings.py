@@ -4,15 +4,17 @@ from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from simulated_streams import log_of, streams_of
 from suggested_recipes import proposed
 
+from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import find_scenario
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.fuse_clocks import correct_clocks, find_clocks, find_offsets
-from tcpipe.stages.fuse_inputs import prepare_sections
+from tcpipe.stages.fuse_clocks import correct_clocks, find_clock_jumps, find_clocks, find_offsets
+from tcpipe.stages.fuse_inputs import Section, prepare_sections
 from tcpipe.stages.label_motion import is_clock_doubtful
 from tcpipe.tables.findings import Subject, select_findings, sort_findings
 
@@ -115,3 +117,23 @@ def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
     assert "gnss" not in found.facts.offsets
     assert found.findings == ()
     assert not any(pair.determined for pair in found.facts.pairs if pair.late == "gnss")
+
+
+def driving(gap_s, *, moves):
+    """Wheels and fixes at 1 m/s with a gap after 10 s, in which the robot ``moves`` on or the clock was set forward."""
+    true_s = np.arange(0.0, 20.0, 0.1)
+    stamp_s = np.where(true_s < 10.0, true_s, true_s + gap_s)
+    place = np.column_stack((stamp_s if moves else true_s, np.zeros((200, 2))))
+    stamp_ns, one = np.round(stamp_s * 1e9).astype(np.int64), np.ones((200, 3))
+    wheels = BodyVelocities(stamp_ns, one, one, one[:, 0])
+    return Section(0, Measurements(gnss=Positions(stamp_ns, place, one), wheels=wheels))
+
+
+def test_a_gap_of_all_sensors_in_which_the_robot_did_not_drive_is_a_step_of_their_clock():
+    ((after_ns, finding),) = find_clock_jumps([driving(3.0, moves=False)])
+    assert (after_ns, finding.code) == (13 * 10**9, "clock-step")
+    assert (finding.numbers["at_s"], finding.numbers["step_s"]) == pytest.approx((13.0, 3.1))
+    assert not list(find_clock_jumps([driving(3.0, moves=True)]))
+    assert not list(find_clock_jumps([driving(0.2, moves=False)]))
+    alone = replace(driving(3.0, moves=False).measurements, gnss=None)
+    assert not list(find_clock_jumps([Section(0, alone)]))
