@@ -87,6 +87,7 @@ class Progress:
         self._sizes: Mapping[str, int] = {}
         self._waiting, self._done, self._begun_s = 0, 0, time.monotonic()
         self._part: int | None = None
+        self._stage_begun = 0.0
         self._bars: rich.progress.Progress | None = None
         if console is None:
             return
@@ -154,18 +155,22 @@ class Progress:
             self.line(f"{self._what}: {100 * done // total} %")
 
     def begin_part(self, number: int, total: int, text: str) -> None:
-        """Fill the bar to part ``number`` of ``total``; the steps of the part fill it further. Without bars a line."""
+        """Fill the bar to part ``number`` of ``total``; each stage of the part fills half of the rest of it. Without bars a line."""
         if self._bars is None:
             self.line(text)
         else:
             self._part = number
+            self._stages.clear()
             self._bars.update(self._all, total=total, completed=number, said=text)
 
     def step(self, step: Step) -> None:
         """Show how far a log is; without bars a line at each of its stages."""
         if self._bars is not None and self._part is not None:
-            share = step.done / step.total if step.total else 0.0
-            self._bars.update(self._all, completed=self._part + share, said=step.stage)
+            if self._stages.get("") != step.stage:
+                self._stages[""], self._stage_begun = step.stage, self._bars.tasks[0].completed
+            share = 0.5 * step.done / step.total if step.total else 0.0
+            completed = self._stage_begun + share * (self._part + 1 - self._stage_begun)
+            self._bars.update(self._all, completed=completed, said=step.stage)
         elif self._bars is not None and step.task:
             name = clean_line(step.task.rsplit("/", 1)[-1])[-_LONGEST_NAME:]
             size = f" {_format_megabytes(step.done)} of {_format_megabytes(step.total)} MB" if step.total else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +47,7 @@ from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.stages.sample import separate_frames
 from tcpipe.store import Store, is_store
-from tcpipe.tables.columns import read_lonlat_deg, to_floats
+from tcpipe.tables.columns import read_ends_m, read_lonlat_deg, to_floats
 
 MOST_SAMPLES = 100_000
 """On the page: of more the first ones, since their order is random."""
@@ -61,14 +61,6 @@ SAMPLE_COLUMNS = (
 """Columns of samples.parquet that the page needs, those that the dataset has."""
 
 
-@dataclass(frozen=True, slots=True)
-class SamplesShown:
-    """The samples of the page, and their middles in the first map's plane, or from the dataset's own origin, (N, 2)."""
-
-    xy_m: Floats
-    json: Json
-
-
 def render_dataset_report(directory: Path, beside: Path | None = None, *, samples: pa.Table | None = None) -> str:
     """Return the HTML page of the dataset in ``directory``; `DatasetError` for another data model.
 
@@ -79,14 +71,13 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, sample
     if samples is None:
         there = sample_columns(directory)
         samples = read_samples(directory, [name for name in SAMPLE_COLUMNS if name in there])
-    shown = select_samples(card, samples)
-    plots, lost = draw_dataset_map(directory, card, shown.xy_m)
+    xy_m, shown = select_samples(card, samples)
+    plots, lost = draw_dataset_map(directory, card, xy_m)
     quality = samples.column("quality").to_numpy()
     try:
-        patches = make_patches_data(directory, card, samples, len(shown.xy_m)) if card.layers else None
+        patches = make_patches_data(directory, card, samples, len(xy_m)) if card.layers else None
     except DatasetError as error:
         patches, lost = None, [*lost, f"no patches are shown: {error.problems[0]}"]
-    waterfall = draw_waterfall(card.distance_by_reason_m)
     hrefs = {} if beside is None else _find_run_pages(beside, card)
     stores = sorted(
         name
@@ -102,7 +93,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, sample
         links=[Link(f"All runs of {name}", f"../{name}/{REPORT}") for name in stores],
         warnings=lost,
         sections=[
-            _make_map_section(shown, card.samples, plots),
+            _make_map_section(len(xy_m), card.samples, plots),
             *([_SELECTION] if samples.num_rows else []),
             PageSection(
                 "Labels",
@@ -115,7 +106,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, sample
             PageSection(
                 "Distance breakdown",
                 "Used and excluded distances add up to the odometer.",
-                plots=[waterfall],
+                plots=[draw_waterfall(card.distance_by_reason_m)],
             ),
             replace(make_repeatability_section(card.repeatability), parts=_make_class_sections(card)),
             _make_audit_section(card),
@@ -143,12 +134,12 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
     ]
 
 
-def _make_map_section(shown: SamplesShown, count: int, plots: list[Plot]) -> PageSection:
+def _make_map_section(shown: int, count: int, plots: list[Plot]) -> PageSection:
     text = "Dashed: region of the split; the buffer is in no split. A click selects the nearest sample, with shift one more; "
     text += "a drag in the plot or the histogram selects all within. Filters combine."
-    if len(shown.xy_m) < count:
-        text += f" Of {count} samples {len(shown.xy_m)}, drawn at random, are shown."
-    if not len(shown.xy_m):
+    if shown < count:
+        text += f" Of {count} samples {shown}, drawn at random, are shown."
+    if not shown:
         return PageSection("The samples on the map", "There is none.")
     return PageSection("The samples on the map", text, controls="dataset.html", plots=plots)
 
@@ -156,7 +147,7 @@ def _make_map_section(shown: SamplesShown, count: int, plots: list[Plot]) -> Pag
 def _make_data(
     card: DatasetCard,
     samples: pa.Table,
-    shown: SamplesShown,
+    shown: Json,
     *,
     patches: Json,
     map_plot: Plot,
@@ -166,7 +157,7 @@ def _make_data(
     names = [renderer.name or "" for renderer in map_plot.figure.renderers]
     return {
         "count": card.samples,
-        "samples": shown.json,
+        "samples": shown,
         "patches": patches,
         "ground": [name.removeprefix("layer ") for name in names if name.startswith("layer ")],
         "classes": [{"id": entry.id, "name": entry.name, "colour": colours[entry.id]} for entry in card.classes],
@@ -278,8 +269,8 @@ def find_nearest_train_m(xy_m: Floats, split: NDArray[np.integer]) -> tuple[Floa
     return apart, nearest
 
 
-def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
-    """Return the samples of the page."""
+def select_samples(card: DatasetCard, table: pa.Table) -> tuple[Floats, Json]:
+    """Return the middles of the page's samples in the first map's plane, or from the dataset's own origin, (N, 2), and their columns."""
     xy_m = _read_middles_m(card, table)
     apart_m, nearest = find_nearest_train_m(xy_m, _find_indices(table, "split", SPLITS))
     starts_ns = np.array(find_first_starts_ns(card, table), np.int64)
@@ -304,27 +295,19 @@ def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
         "after_ns": ("u32", after % 10**9),
         "nearest": ("u32", np.where(near, nearest, np.arange(len(near)))[:count]),
     }
-    return SamplesShown(xy_m[:count], {"packed": pack_columns(columns), "ids": _find_odd_ids(table)})
+    return xy_m[:count], {"packed": pack_columns(columns), "ids": _find_odd_ids(table)}
 
 
 def _read_middles_m(card: DatasetCard, table: pa.Table) -> Floats:
     if card.without_coordinates:
-        start_m, end_m = _read_ends_m(table)
-        return 0.5 * (start_m + end_m)
+        return np.asarray(np.mean(read_ends_m(table), axis=0))
     if card.plane_crs == LOCAL:
-        starts_ns = np.array(find_first_starts_ns(card, table))
-        frame = np.argsort(np.argsort(starts_ns, kind="stable"))[
-            _find_indices(table, "run_id", [run.run_id for run in card.runs])
-        ]
-        start_m, end_m = separate_frames(frame, _read_ends_m(table))
-        return 0.5 * (start_m + end_m)
+        frames = np.argsort(np.argsort(find_first_starts_ns(card, table), kind="stable"))
+        frame = frames[_find_indices(table, "run_id", [run.run_id for run in card.runs])]
+        return np.asarray(np.mean(separate_frames(frame, read_ends_m(table)), axis=0))
     to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.plane_crs, always_xy=True)
     middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
     return np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
-
-
-def _read_ends_m(table: pa.Table) -> list[Floats]:
-    return [np.column_stack([to_floats(table, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")]
 
 
 def _find_indices(table: pa.Table, column: str, names: Sequence[str]) -> NDArray[np.int32]:

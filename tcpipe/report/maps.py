@@ -31,7 +31,7 @@ from tcpipe.report.pictures import (
 )
 from tcpipe.report.plots import Plot, lay_picture, make_map_plot, make_plot
 from tcpipe.store import Store
-from tcpipe.tables.columns import read_lonlat_deg, to_floats
+from tcpipe.tables.columns import read_ends_m, read_lonlat_deg, stack_floats
 from tcpipe.terrain.layers import TerrainClass
 
 Pictures = Mapping[str, str]
@@ -194,14 +194,11 @@ class StoredMaps:
 
 def draw_run_map(run: StoredRun, track: pa.Table, segments: pa.Table, maps: StoredMaps, *, has_datum: bool) -> RunMap:
     """Return the map; ``has_datum`` is whether the track has a place on Earth."""
-    lonlat = np.column_stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")])
+    lonlat = stack_floats(track, "lon_deg", "lat_deg")
     ground, missing = _find_ground(run, lonlat, maps) if has_datum else (None, [])
     is_complete = not missing
     if ground is None:
-        start, end = (
-            np.column_stack([to_floats(segments, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")
-        )
-        xy_m = np.column_stack([to_floats(track, "x_m"), to_floats(track, "y_m")])
+        xy_m = stack_floats(track, "x_m", "y_m")
         plot = _draw_track(("east [m]", "north [m]"), xy_m, {})
         if not has_datum:
             missing = ["No GNSS fix: the track has only local coordinates and cannot be placed on a map."]
@@ -209,7 +206,7 @@ def draw_run_map(run: StoredRun, track: pa.Table, segments: pa.Table, maps: Stor
             missing = [
                 "No map of the store covers the track." if maps.records else "The store has no map ('tcpipe add-map')."
             ]
-        return RunMap(plot, xy_m, (start, end), (), tuple(missing), is_complete)
+        return RunMap(plot, xy_m, read_ends_m(segments), (), tuple(missing), is_complete)
     to_map, source, pictures = ground
     xy_m = to_map(lonlat)
     classes = source.layers["terrain"].classes if "terrain" in source.layers else None
@@ -225,8 +222,7 @@ def draw_tracks(runs: Sequence[StoredRun], maps: StoredMaps) -> Plot | None:
     places_deg = dict[str, Floats]()
     for run in runs:
         with suppress(StoreError):
-            track = run.table("track", ["lon_deg", "lat_deg"])
-            lonlat = np.column_stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")])
+            lonlat = stack_floats(run.table("track", ["lon_deg", "lat_deg"]), "lon_deg", "lat_deg")
             if len(known := lonlat[np.isfinite(lonlat).all(axis=1)]):
                 places_deg[run.run_id] = known[:: max(1, len(known) // _MOST_POINTS)]
     if not places_deg:

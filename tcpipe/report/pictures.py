@@ -23,7 +23,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.maps.map_files import PICTURE_PX, MapFile
 from tcpipe.report.colours import choose_class_colours
 from tcpipe.tables.columns import to_floats
-from tcpipe.terrain.layers import COLOURS, MAX_ID, ClassTable, Pixels
+from tcpipe.terrain.layers import COLOURS, MAX_ID, ClassTable, Layer, Pixels
 
 Bytes = NDArray[np.uint8]
 
@@ -259,7 +259,7 @@ def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, cou
     rows = patches.select(samples.slice(0, count))
     pixels, layers = patches.read(rows), list[Json]()
     for name, stack in pixels.items():
-        sheet, exact = _make_sheet(name, stack, patches.files, _find_range(stack))
+        sheet, exact = _make_sheet(stack, patches.files.layers[name])
         layers.append({"name": name, "uri": make_picture_uri(sheet, exact=exact)})
     return {"rows": rows.tolist(), "px": next(iter(pixels.values())).shape[1], "across": ACROSS, "layers": layers}
 
@@ -272,22 +272,13 @@ def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[An
     return {name: colour if name == "ortho" else stack for name, stack in pixels.items() if name not in COLOURS}
 
 
-def _find_range(stack: NDArray[np.generic]) -> tuple[float, float]:
-    """Return the range that contains most pixels."""
-    low, high = np.percentile(stack.astype(np.float64), (1, 99))
-    return float(low), float(high)
-
-
-def _make_sheet(
-    name: str, stack: NDArray[np.generic], files: PatchFiles, shown: tuple[float, float]
-) -> tuple[NDArray[np.uint8], bool]:
-    """Return patches of a layer as one sheet, and whether every pixel counts; a photograph is shown over a range of its values."""
-    layer = files.layers[name]
+def _make_sheet(stack: NDArray[np.generic], layer: Layer) -> tuple[NDArray[np.uint8], bool]:
+    """Return patches of a layer as one sheet, and whether every pixel counts; a photograph over the range of 98 % of its values."""
     if layer.kind == "categorical":
         return make_sheet(colour_classes(stack, layer.classes)), True
     values = stack.astype(np.float64)
-    if name.startswith("ortho"):
-        low, high = shown
+    if layer.stack == "greys":
+        low, high = np.percentile(values, (1, 99))
         return make_sheet(np.clip((values - low) / max(high - low, 1.0) * 255, 0, 255).astype(np.uint8)), False
     values[stack == layer.nodata] = np.nan
     return make_sheet(colour_heights(values)), False

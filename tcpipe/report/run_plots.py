@@ -17,7 +17,7 @@ from tcpipe.report.colours import KEPT, LINE_COLOURS, REASON_COLOURS, SEVERITY_C
 from tcpipe.report.page import Column, make_shown_column, pack_columns
 from tcpipe.report.plots import Plot, add_cursor, make_plot, show_text
 from tcpipe.tables.bits import DropReason, flag_name
-from tcpipe.tables.columns import to_floats, to_integers, to_texts
+from tcpipe.tables.columns import stack_floats, to_floats, to_integers, to_texts
 from tcpipe.tables.findings import Finding
 
 MOST_VALUES = 80_000
@@ -189,7 +189,7 @@ def _read_speed(table: pa.Table) -> Floats:
 def _compute_chord_speed(table: pa.Table, t_s: Floats) -> tuple[Floats, Floats]:
     """Return times in the middle of a second, and how fast the place moved over it [m/s]."""
     if "x_m" in table.column_names:
-        xy_m = np.column_stack([to_floats(table, "x_m"), to_floats(table, "y_m")])
+        xy_m = stack_floats(table, "x_m", "y_m")
     else:
         lon, lat, alt = (to_floats(table, name) for name in ("lon_deg", "lat_deg", "alt_m"))
         first = (float(lon[0]), float(lat[0]), float(alt[0])) if len(lon) else (0.0, 0.0, 0.0)

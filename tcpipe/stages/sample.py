@@ -14,7 +14,7 @@ from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.bits import Loss
-from tcpipe.tables.columns import read_lonlat_deg, to_floats
+from tcpipe.tables.columns import read_ends_m, read_lonlat_deg, to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.projection import Projection
@@ -123,8 +123,7 @@ def place_segments(segments: pa.Table, place: Projection | NDArray[np.integer], 
     if isinstance(place, Projection):
         start, end = (place.forward(read_lonlat_deg(segments, name)) for name in _ENDS)
     else:
-        ends = [np.stack([to_floats(segments, f"{name}_{axis}_m") for axis in "xy"], axis=1) for name in _ENDS]
-        start, end = separate_frames(place, ends)
+        start, end = separate_frames(place, read_ends_m(segments))
     corners = compute_footprints(make_patch_frames(start, end, to_floats(segments, "chord_m")), config.patch_m)
     unknown, nothing = np.full(count, np.nan), np.zeros(count, np.uint8)
     numbers = (

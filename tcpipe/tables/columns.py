@@ -192,9 +192,19 @@ def to_floats(table: pa.Table, name: str) -> Floats:
     return np.asarray(to_numbers(table.column(name)), np.float64)
 
 
+def stack_floats(table: pa.Table, *names: str) -> Floats:
+    """Return columns side by side as float64, null as NaN, shape (N, columns)."""
+    return np.stack([to_floats(table, name) for name in names], axis=1)
+
+
 def read_lonlat_deg(table: pa.Table, end: str) -> Floats:
     """Return longitude and latitude of the ``start`` or ``end`` of segments [deg], null as NaN, shape (N, 2)."""
-    return np.stack([to_floats(table, f"{end}_{axis}_deg") for axis in ("lon", "lat")], axis=1)
+    return stack_floats(table, f"{end}_lon_deg", f"{end}_lat_deg")
+
+
+def read_ends_m(segments: pa.Table) -> tuple[Floats, Floats]:
+    """Return east and north of the start and of the end of segments in their own frames [m], null as NaN, shape (N, 2) each."""
+    return stack_floats(segments, "start_x_m", "start_y_m"), stack_floats(segments, "end_x_m", "end_y_m")
 
 
 def read_float_columns(table: pa.Table) -> dict[str, Floats]:

@@ -115,6 +115,19 @@ def test_a_log_under_way_has_its_name_stage_and_bytes_and_all_have_a_count_rate_
     assert "a.bag" not in drawn()
 
 
+def test_a_bar_of_parts_fills_and_never_falls(screen):
+    shown, drawn = screen
+    filled = []
+    for part in range(2):
+        shown.begin_part(part, 2, "simulating")
+        for stage in ("reading", "fusing", "reading"):
+            for done in (0, 5, 10):
+                shown.step(Step("", stage, done, 10))
+                filled.append(drawn().count("\u2501"))
+    assert filled == sorted(filled)
+    assert 0 < filled[8] < 12 < filled[-1] < 24
+
+
 def test_a_name_is_shown_as_text(screen):
     shown, drawn = screen
     shown.expect({HOSTILE: MB})

@@ -99,11 +99,11 @@ def test_the_same_dataset_has_the_same_page(built, page):
 def test_of_too_many_samples_the_first_are_shown(built, monkeypatch):
     monkeypatch.setattr(dataset_report, "MOST_SAMPLES", 30)
     card, table = open_dataset(built).card, pq.read_table(built / "samples.parquet", columns=list(SAMPLE_COLUMNS))
-    shown = select_samples(card, table)
-    energy = unpacked(shown.json["packed"], "energy")
+    xy_m, shown = select_samples(card, table)
+    energy = unpacked(shown["packed"], "energy")
     np.testing.assert_allclose(energy, table["energy_joule"].to_numpy()[:30], rtol=1e-3)
-    assert len(shown.xy_m) == 30
-    assert unpacked(shown.json["packed"], "nearest").max() < 30
+    assert len(xy_m) == 30
+    assert unpacked(shown["packed"], "nearest").max() < 30
     data = data_of(render_dataset_report(built))
     assert max(data["patches"]["rows"]) < 30
     assert data["count"] == table.num_rows
