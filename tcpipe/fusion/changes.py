@@ -209,18 +209,16 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
         rows, axes = np.flatnonzero(np.isfinite(value[:, kind, 0])), slice(state.SIZES[kind])
         if rows.size:
             series = tests.fix_innovation[rows] if kind == Kind.FIX else value[rows, kind, axes]
-            is_spike = _find_spikes(series, np.sqrt(ticks.inputs.variance[rows, kind, axes]))
+            off, least = (
+                np.abs(series - compute_running_median(series, 7)),
+                np.sqrt(ticks.inputs.variance[rows, kind, axes]),
+            )
+            is_spike = (off > SPIKE_RATIO * np.maximum(np.median(off, axis=0), least)).any(axis=1)
             rejected = tests.verdict[rows, kind] != GateVerdict.ACCEPTED
             for first, last in _find_long_runs(rows, rejected, ticks.inputs.period_s, kind):
                 rejected[first:last] = False
             value[rows[is_spike | rejected], kind] = np.nan
     return value
-
-
-def _find_spikes(series: Floats, least: Floats) -> NDArray[np.bool_]:
-    """Return which rows of a series (N, k) are spikes; the usual distance from the median around is ``least`` (N, k) or more."""
-    off = np.abs(series - compute_running_median(series, 7))
-    return np.asarray((off > SPIKE_RATIO * np.maximum(np.median(off, axis=0), least)).any(axis=1))
 
 
 def _find_long_runs(rows: Ints, mask: NDArray[np.bool_], period_s: float, kind: int) -> list[tuple[int, int]]:

@@ -87,8 +87,8 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     start.x[:9] = levelled.states[0, :9]
     made = section.filter(start)
     smoothed, events = smooth_section(made)
-    if section.is_arm_contradicted(made, smoothed):
-        section = section.forget_arm()
+    if (corrected := section.correct_arm(made, smoothed)) is not section:
+        section = corrected
         start = section.make_start(initial)._replace(x=start.x)
         made = section.filter(start)
         smoothed, events = smooth_section(made)
@@ -192,22 +192,17 @@ class SectionModel:
         )
         return ticks, model, widen_start(start, std).select(model.active)
 
-    def is_arm_contradicted(self, made: Pass, smoothed: Smoothed) -> bool:
-        """Return whether the section surely shows the antenna elsewhere than where it is stated."""
+    def correct_arm(self, made: Pass, smoothed: Smoothed) -> SectionModel:
+        """Return the section with an antenna at an unknown place, if it surely shows it elsewhere than where it is stated; else itself."""
         gnss, active = self.measurements.gnss, list(made.model.active)
         if gnss is None or Error.ARM not in active:
-            return False
+            return self
         off = np.abs(smoothed.states[-1, Error.ARM + 6 : Error.ARM + 9] - gnss.lever_arm_m)
         place = active.index(Error.ARM)
         known = smoothed.spreads[-1, place : place + 3]
-        return bool((off > np.maximum(2.0 * np.asarray(gnss.lever_arm_std_m), MIN_SIGMAS * known)).any())
-
-    def forget_arm(self) -> SectionModel:
-        """Return the section with an antenna whose place nothing states."""
-        m = self.measurements
-        if m.gnss is None:
+        if not (off > np.maximum(2.0 * np.asarray(gnss.lever_arm_std_m), MIN_SIGMAS * known)).any():
             return self
-        m = replace(m, gnss=replace(m.gnss, lever_arm_std_m=UNSTATED_ARM_STD_M))
+        m = replace(self.measurements, gnss=replace(gnss, lever_arm_std_m=UNSTATED_ARM_STD_M))
         return replace(self, measurements=m, std=make_priors(m, self.noise, self.ticks)[0])
 
     def explain(self, made: Pass, events: Sequence[Change], start: Memory) -> Hypothesis:

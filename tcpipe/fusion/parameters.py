@@ -107,8 +107,13 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
             # In 100 s the mean of a varying scale strays by as much as the scale varies.
             std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].correlated.variance / 100.0)
     time_s = np.full(state.N, np.inf)
-    for error, process in _list_varying_scales(m, noise).items():
-        std[error], time_s[error] = np.sqrt(process.variance), process.time_s
+    if m.odometries() and is_length_observable(
+        m, noise.horizontal
+    ):  # only fixes show how scales vary around their means
+        slips = {WHEELS: Error.WHEEL_SLIP, VISUAL: Error.VISUAL_SLIP}
+        varying = [(slips[role], noise.odometries[role].correlated) for role in m.odometries()]
+        for error, process in (*varying, (Error.SHARED_SCALE, noise.shared_scale)):
+            std[error], time_s[error] = np.sqrt(process.variance), process.time_s
     std[Error.TURN_SCALE] = turn_scale_std(m)
     # Wheels skid otherwise in each turn.
     walk[Error.TURN_SCALE] = 0.0 if has_imu else np.sqrt(2.0 / _MINUTE_S) * std[Error.TURN_SCALE]
@@ -139,15 +144,6 @@ def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> 
 def find_walk(process: GaussMarkov) -> float:
     """Return the deviation of a second's walk that strays as far as a Gauss-Markov process over a minute."""
     return float(np.sqrt(2.0 * process.variance * -np.expm1(-_MINUTE_S / process.time_s) / _MINUTE_S))
-
-
-def _list_varying_scales(m: Measurements, noise: NoiseModel) -> dict[int, GaussMarkov]:
-    """Return how scales of odometries vary around their means, by error; only fixes show it."""
-    if not is_length_observable(m, noise.horizontal):
-        return {}
-    places = {WHEELS: Error.WHEEL_SLIP, VISUAL: Error.VISUAL_SLIP}
-    found: dict[int, GaussMarkov] = {places[role]: noise.odometries[role].correlated for role in m.odometries()}
-    return found | ({Error.SHARED_SCALE: noise.shared_scale} if found else {})
 
 
 _BODY = (*range(Error.U, Error.GYRO_BIAS + 3), *range(Error.MOUNT, Error.MOUNT + 3))

@@ -19,7 +19,6 @@ from tcpipe.fusion.measurements import (
     VISUAL,
     WHEELS,
     BodyVelocities,
-    InertialMeasurements,
     Measurements,
     Positions,
 )
@@ -113,7 +112,10 @@ def make_motion_noise(  # noqa: PLR0917
     density[~by_gyro, :3] = _make_turn_density(m, noise, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
     inertial = mode == Mode.INERTIAL
     if m.imu is not None and inertial.any():
-        density[inertial, 3:] = _compute_accelerometer_density(m.imu, stamp_ns[inertial])[:, None]
+        noise_mps2 = m.imu.accelerometer_noise_mps2
+        of_samples = np.full(m.imu.stamp_ns.size, m.imu.accelerometer_std_mps2) if noise_mps2 is None else noise_mps2
+        of_samples = np.square(of_samples) * 1e-9 * compute_median_period_ns(m.imu.stamp_ns) + 1e-6
+        density[inertial, 3:] = np.interp(stamp_ns[inertial], m.imu.stamp_ns, of_samples)[:, None]
     if not inertial.all():
         density[~inertial, 3:] = _compute_odometry_density(m, stamp_ns[~inertial])[:, None]
         density[~inertial, 4:] *= not m.odometries()
@@ -148,12 +150,6 @@ def _make_turn_density(
         density[rows] += PRIORS[f"{role} turn scale"].variance * np.square(rate_radps[rows])
     density[:, :2] += (ground * speed_mps)[:, None]
     return density
-
-
-def _compute_accelerometer_density(imu: InertialMeasurements, at_ns: Ints) -> Floats:
-    noise = imu.accelerometer_noise_mps2
-    noise = np.full(imu.stamp_ns.size, imu.accelerometer_std_mps2) if noise is None else noise
-    return np.interp(at_ns, imu.stamp_ns, np.square(noise) * 1e-9 * compute_median_period_ns(imu.stamp_ns) + 1e-6)
 
 
 def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:

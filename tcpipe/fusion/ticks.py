@@ -198,7 +198,10 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     claimed = source.variance_m2ps2
     found = claimed.copy()
     relative = claimed[:, 0] / np.median(claimed[:, 0])
-    of_run, scatter = noise.odometries[role], _estimate_scatter(source.velocity_mps[:, 0])
+    speed_mps, of_run = source.velocity_mps[:, 0], noise.odometries[role]
+    # The scatter of the samples of a moving robot around their neighbours', by the median: wild ones do not move it.
+    second = np.diff(speed_mps, n=2)[(np.abs(speed_mps) > 0.05)[1:-1]]
+    scatter = estimate_robust_std(second) ** 2 / 6.0 if second.size > 1 else 0.0
     density = max(of_run.white, PRIORS[f"{role} velocity"].variance)  # the mean of a tick is no better
     if of_run.white_data_share < DETERMINED:  # what is claimed beyond the scatter of the samples lasts for 0.1 s
         density = max(density, 0.1 * (float(np.median(claimed[:, 0])) - scatter))
@@ -210,12 +213,6 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     if flat:
         found = found + _compute_unseen_turn_variance(source.stamp_ns, source.lever_arm_m)
     return found
-
-
-def _estimate_scatter(velocity_mps: Floats) -> float:
-    """Return the variance of a moving odometry's samples around their neighbours', by the median: wild ones do not move it."""
-    second = np.diff(velocity_mps, n=2)[(np.abs(velocity_mps) > 0.05)[1:-1]]
-    return estimate_robust_std(second) ** 2 / 6.0 if second.size > 1 else 0.0
 
 
 def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, float, float]) -> Floats:
