@@ -11,7 +11,7 @@ from rosbags.typesys import get_types_from_msg
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.log_part import MessageBlock
 from tcpipe.formats.logs.ros_types import MessageType
-from tcpipe.logs.wire_types import Array, Record, Scalar, Text, make_record
+from tcpipe.logs.wire_types import Array, LayoutError, Record, Scalar, Text, find_dialect, make_record
 
 CODES = ("?", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 HEADERS = {b"\x00\x00": (">", 8), b"\x00\x01": ("<", 8), b"\x00\x06": (">", 4), b"\x00\x07": ("<", 4), None: ("<", 1)}
@@ -145,3 +145,9 @@ def test_a_list_too_long_to_be_walked_side_by_side_is_read_message_by_message(he
     assert lost == 0
     assert found["texts"].to_pylist() == [value["texts"] for value in values]
     assert found["number"].to_pylist() == [value["number"] for value in values]
+
+
+@pytest.mark.parametrize("payload", [b"", b"\x00\x03\x00\x00" + bytes(12)], ids=["empty", "not a plain encoding"])
+def test_an_encoding_that_is_none_of_ros_is_refused(payload):
+    with pytest.raises(LayoutError):
+        find_dialect(payload, "cdr")
