@@ -14,7 +14,6 @@ from stored_files import map_path, only_run
 
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.building import read_class_scheme
-from tcpipe.simulation import simulate
 
 DRAWS_DATASET_PAGES = True
 
@@ -25,10 +24,9 @@ CLASSES = (HTML, "a|b `c` [red]*d*", r"$\oops{$ {{ 7 * 7 }}")
 
 
 @pytest.fixture(scope="module")
-def work(tmp_path_factory):
+def work(tmp_path_factory, tiny_site):
     here = tmp_path_factory.mktemp("names")
-    site = simulate(here / "site", scenario="tiny", seed=3)
-    with site.rasters["classes"].open(newline="") as stream:
+    with tiny_site.rasters["classes"].open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     for row, name in zip(rows, [*CLASSES, *(f"{HTML}{n}" for n in range(len(rows)))], strict=False):
         row["name"] = name
@@ -36,9 +34,9 @@ def work(tmp_path_factory):
         table = csv.DictWriter(stream, list(rows[0]))
         table.writeheader()
         table.writerows(rows)
-    log = here / f"run{TERMINAL}{HTML.replace('/', '')}{site.logs[0].suffix}"
-    shutil.copy(site.logs[0], log)
-    layers = [item for role in ("height", "ortho", "terrain") for item in (f"--{role}", site.rasters[role])]
+    log = here / f"run{TERMINAL}{HTML.replace('/', '')}{tiny_site.logs[0].suffix}"
+    shutil.copy(tiny_site.logs[0], log)
+    layers = [item for role in ("height", "ortho", "terrain") for item in (f"--{role}", tiny_site.rasters[role])]
     return here, log, layers
 
 

@@ -16,7 +16,6 @@ from tcpipe.errors import LogError, TcpipeError, UsageError, hide_secrets
 from tcpipe.formats.dataset_files import read_samples
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.place import open_place
-from tcpipe.simulation import simulate
 from tcpipe.store import Store
 
 DRAWS_DATASET_PAGES = True
@@ -70,11 +69,6 @@ def presigned(root):
         server.server_close()
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    return simulate(tmp_path_factory.mktemp("site"), scenario="tiny", seed=3)
-
-
 @pytest.fixture(autouse=True)
 def no_proxy(monkeypatch):
     for name in ("HTTP_PROXY", "http_proxy", "HTTPS_PROXY", "https_proxy"):
@@ -87,7 +81,7 @@ def assert_hidden(texts, *secrets):
             assert secret.encode() not in text, (where, secret)
 
 
-def test_a_signature_is_in_nothing_that_is_written_or_printed(site, tmp_path):
+def test_a_signature_is_in_nothing_that_is_written_or_printed(tiny_site, tmp_path):
     printed = []
 
     def run(*arguments, codes=(0,)):
@@ -96,10 +90,10 @@ def test_a_signature_is_in_nothing_that_is_written_or_printed(site, tmp_path):
         printed.append((arguments, (done.stdout + done.stderr).encode()))
         return done
 
-    layers = [item for role in ("height", "ortho", "terrain") for item in (f"--{role}", site.rasters[role])]
-    layers += ["--classes", site.rasters["classes"]]
-    name = site.logs[0].name
-    with presigned(site.logs[0].parent) as server:
+    layers = [item for role in ("height", "ortho", "terrain") for item in (f"--{role}", tiny_site.rasters[role])]
+    layers += ["--classes", tiny_site.rasters["classes"]]
+    name = tiny_site.logs[0].name
+    with presigned(tiny_site.logs[0].parent) as server:
         url = f"{server}/{name}"
         gone, wrong = f"{server}/gone.mcap{SIGNED}", f"{url}?X-Amz-Signature=wr0ngS1gnature"
         for command in ("inspect", "preflight"):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,17 +14,21 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from stored_files import manifest as manifest_path
 from stored_files import only_run
 
-from tcpipe.simulation import simulate
-
 GEOD = Geod(ellps="WGS84")
 
 
 @pytest.fixture(scope="module")
-def work(tmp_path_factory):
+def work(tmp_path_factory, tiny_site):
     here = tmp_path_factory.mktemp("trust")
-    site = simulate(here / "site", scenario="tiny", seed=3)
-    layers = [item for name in ("height", "ortho", "terrain", "classes") for item in (f"--{name}", site.rasters[name])]
-    for arguments in (("ingest", *site.logs), ("add-map", "site", *layers), ("build-dataset",)):
+    shutil.copytree(tiny_site.directory, here / "site")
+    layers = [
+        item for name in ("height", "ortho", "terrain", "classes") for item in (f"--{name}", tiny_site.rasters[name])
+    ]
+    for arguments in (
+        ("ingest", *(here / "site" / "logs").iterdir()),
+        ("add-map", "site", *layers),
+        ("build-dataset",),
+    ):
         done = tcpipe(*arguments, "--quiet", cwd=here)
         # so small a site is one block, and that is told: nothing tests
         assert (done.returncode, done.stderr[:34]) == (
