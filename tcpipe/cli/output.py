@@ -155,7 +155,7 @@ class Progress:
             self.line(f"{self._what}: {100 * done // total} %")
 
     def begin_part(self, number: int, total: int, text: str) -> None:
-        """Fill the bar to part ``number`` of ``total``; each stage of the part fills half of the rest of it. Without bars a line."""
+        """Fill the bar to part ``number`` of ``total``; each stage fills half of its rest. Without bars, a line."""
         if self._bars is None:
             self.line(text)
         else:

@@ -1,8 +1,8 @@
 """Outputs appear whole or not at all: written under a temporary name beside their place, synced, then renamed.
 
-A temporary is in a *holder* beside its place, ``.tmp-<name of the place>-<8 hex>``, which its writer locks. An unlocked holder is that of
-a killed process. Each writer into a directory first clears it (`clear`): an output that was moved aside returns, all other temporaries are
-removed.
+A temporary is in a *holder* beside its place, ``.tmp-<name of the place>-<8 hex>``, which its writer locks. An unlocked
+holder is that of a killed process. Each writer into a directory first clears it (`clear`): an output that was moved
+aside returns, all other temporaries are removed.
 
 This module also checks paths of users: inputs must exist, outputs must be on this machine (else exit code 2).
 """
@@ -69,7 +69,7 @@ def write_atomic_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def write_atomic_directory(path: Path) -> Iterator[Path]:
-    """Yield a temporary directory; on success it takes the place of ``path`` (an old one goes), on failure it is removed."""
+    """Yield a temporary directory; it replaces ``path`` on success (the old one is removed), else it is removed."""
     with _convert_os_errors(path), _make_parents(path) as place, _make_locked_holder(place) as holder:
         temporary = holder / place.name
         temporary.mkdir()
@@ -87,7 +87,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def put_file(path: Path, data: bytes, *, staging: Path) -> None:
-    """Write a file, synced, in place of an earlier one; `make_working_directory` in ``staging`` holds it until it is whole."""
+    """Write a synced file in place of an earlier one; `make_working_directory` in ``staging`` holds it until then."""
     with _convert_os_errors(path), _make_parents(path) as place, make_working_directory(staging) as directory:
         temporary = directory / "new"
         with temporary.open("wb") as stream:
@@ -100,7 +100,7 @@ def put_file(path: Path, data: bytes, *, staging: Path) -> None:
 
 @contextmanager
 def make_working_directory(staging: Path) -> Iterator[Path]:
-    """Yield an empty directory among the temporaries in ``staging``; it is removed at the end, or by the next call after a kill."""
+    """Yield an empty directory in ``staging``; it is removed at the end, or by the next call after a kill."""
     staging.mkdir(parents=True, exist_ok=True)
     with _make_locked_holder(Path(os.path.realpath(staging), "new")) as holder:
         directory = holder / "new"
@@ -110,7 +110,7 @@ def make_working_directory(staging: Path) -> Iterator[Path]:
 
 @contextmanager
 def make_scratch_directory() -> Iterator[Path]:
-    """Yield an empty directory of this user in the system's own (``TMPDIR``); temporaries of killed processes there are removed before."""
+    """Yield an empty directory of this user below ``TMPDIR``; those of killed processes are removed first."""
     clear_scratch()
     holder, lock = _make_locked_directory(Path(tempfile.gettempdir()), _make_scratch_prefix(), mode=0o700)
     try:
@@ -141,7 +141,7 @@ def make_lasting_scratch() -> Path:
 
 
 def put_directory(directory: Path, path: Path) -> None:
-    """Rename a directory from a `make_working_directory`, synced, to a path of the same file system that does not exist."""
+    """Rename a synced directory from `make_working_directory` to a new path of the same file system."""
     with _convert_os_errors(path), _make_parents(path) as place:
         _sync_files(directory)
         directory.rename(place)
@@ -149,7 +149,7 @@ def put_directory(directory: Path, path: Path) -> None:
 
 
 def remove(path: Path, staging: Path) -> None:
-    """Remove a file, or a directory after a rename into a `make_working_directory`: a kill leaves no half of it at ``path``."""
+    """Remove a file, or a directory after a rename into a `make_working_directory`: a kill leaves no part of it."""
     if not path.is_dir() or path.is_symlink():
         path.unlink()
         return
@@ -181,8 +181,8 @@ def lock_directory(directory: Path) -> Iterator[None]:
 def _convert_os_errors(path: Path) -> Iterator[None]:
     """Turn what the operating system says while ``path`` is written into one line about ``path`` itself.
 
-    An error that names another file is of that file: what is read for ``path``. One that names none is of writing, whatever its number,
-    as readers turn theirs into errors of their own.
+    An error that names another file is of that file: what is read for ``path``. One that names none is of writing,
+    whatever its number, as readers turn theirs into errors of their own.
     """
     try:
         yield
@@ -223,7 +223,7 @@ def _make_parents(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _make_locked_holder(place: Path) -> Iterator[Path]:
-    """Yield a new locked directory beside ``place`` and remove it in the end; what was abandoned there is cleared first."""
+    """Yield a new locked directory beside ``place`` and remove it at the end; abandoned ones are removed first."""
     clear(place.parent)
     holder, lock = _make_locked_directory(place.parent, _make_prefix(place.name))
     try:

@@ -1,7 +1,8 @@
 """A cache of limited size on this machine: tcpipe does not fetch from a bucket again what it has fetched once.
 
-A key determines the content (a sha256; an object's version and a range of it), so no file here is ever outdated. The cache is the directory
-``TCPIPE_CACHE``, else one in the user's cache directory. Above ``TCPIPE_CACHE_BYTES`` (8 GB) it removes the least recently used files.
+A key determines the content (a sha256; an object's version and a range of it), so no file here is ever outdated. The
+cache is the directory ``TCPIPE_CACHE``, else one in the user's cache directory. Above ``TCPIPE_CACHE_BYTES`` (8 GB) it
+removes the least recently used files.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from tcpipe.errors import StoreError, UsageError
 
 _MOST_BYTES = 8_000_000_000
 _SHARE_UNSEEN = 64
-"""A process may exceed the limit by one part in so many before it looks at all files of the cache again, which takes time."""
+"""Fraction of the limit that a process may exceed before it scans the whole cache again, which takes time [1]."""
 _unseen_bytes = [float("inf")]
 """Bytes that this process has added since it last listed the cache; infinite before the first list."""
 _IN_USE_S = 60.0

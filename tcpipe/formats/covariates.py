@@ -29,7 +29,7 @@ _MOSTLY = 0.5
 
 @dataclass(frozen=True, slots=True)
 class CovariateTable:
-    """A table of covariates, by rising and different stamps; ``findings`` name rows left out, and columns that a few words make text."""
+    """Covariates with rising, unique stamps; ``findings``: omitted rows, and number columns made text by few words."""
 
     name: str
     checksum: Checksum
@@ -46,8 +46,8 @@ class CovariateTable:
     def join(self, stamp_ns: Ints, *, max_age_s: float) -> tuple[pa.Table, Mask]:
         """Return the last row at or before each stamp that is not older than the limit; and which stamps a row reaches.
 
-        ``stamp_ns`` (UTC, shape (N,)) may be in any order; columns are called as the file, without its ending, and the column. They are
-        null where no row reaches, or it has no value.
+        ``stamp_ns`` (UTC, shape (N,)) may be in any order; columns are called as the file, without its ending, and the
+        column. They are null where no row reaches, or it has no value.
         """
         wanted = pl.DataFrame({_STAMP: stamp_ns}).with_row_index(_ROW).sort(_STAMP)
         there = self.rows.with_columns(pl.col(_STAMP).alias(_FOUND))
@@ -73,8 +73,9 @@ class CovariateTable:
 def read_covariates(path: Path, *, time_column: str | None = None, time_unit: TimeUnit = "auto") -> CovariateTable:
     """Read a table of covariates.
 
-    Without ``time_column`` the only one that has its name; ``time_unit`` is of stamps that are numbers, text is ISO 8601, and UTC where it
-    names no zone. `DatasetError`: it cannot be read, has no time, or two rows of one time differ.
+    Without ``time_column`` the only one that has its name; ``time_unit`` is of stamps that are numbers, text is ISO
+    8601, and UTC where it names no zone. `DatasetError`: it cannot be read, has no time, or two rows of one time
+    differ.
     """
     table = _read_rows(path)
     column = _time_column(path, table, time_column)
@@ -149,7 +150,7 @@ def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
 
 
 def _parse_stamps(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
-    """Return stamps [ns since 1970, UTC], null for a row without a stamp; times without a zone are UTC, dates their midnight."""
+    """Return stamps [ns since 1970, UTC], null if a row has none; times without a zone are UTC, dates midnight."""
     if not column.count():
         return column.cast(pl.Int64)
     if column.dtype == pl.String:
@@ -166,7 +167,7 @@ def _parse_stamps(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
 
 
 def _parse_values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], list[Finding]]:
-    """Return numbers as float64 without NaN, all else as text; and findings on columns of numbers that a few words make text."""
+    """Return numbers as float64 without NaN, all else as text; findings name number columns made text by few words."""
     made, findings = list[pl.Series](), list[Finding]()
     for column in table:
         if column.dtype.is_numeric():

@@ -44,7 +44,7 @@ _ENCODING_BY_SUFFIX = {
 
 
 def format_croissant(card: DatasetCard, samples: pa.Schema, files: Mapping[str, Checksum]) -> str:
-    """Return the document as JSON-LD; ``samples`` is the schema of the table of samples, whose fields' metadata give their meanings."""
+    """Return the document as JSON-LD; the metadata of ``samples``, the schema of the samples, gives their meanings."""
     source = {"fileObject": {"@id": SAMPLES}}
     records = [_describe_records("samples", "One record a sample, in the order of the patches.", samples, source)]
     sets = []

@@ -1,4 +1,4 @@
-"""The card of a dataset, ``dataset.json``: everything needed to use it, to cite it, and to check it, as one tree of dataclasses."""
+"""The card of a dataset, ``dataset.json``: all that is needed to use, cite and check it, as dataclasses."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ class RunSource:
 
 @dataclass(frozen=True, slots=True)
 class Covariate:
-    """A table that was joined to the samples by time: its file, what its rows span (UTC), and by column the samples without a value."""
+    """A table joined to the samples by time: its file, its time span (UTC), and samples without a value by column."""
 
     name: str
     checksum: Checksum
@@ -192,7 +192,7 @@ class Covariate:
 
 @dataclass(frozen=True, slots=True)
 class FlaggedSamples:
-    """Samples that carry a quality flag which not all of them carry: how many, their share of all (0 to 1); and samples by flag."""
+    """Samples with a quality flag that not all samples have: their number, share (0 to 1), and number by flag."""
 
     samples: int
     share: float
@@ -201,7 +201,7 @@ class FlaggedSamples:
 
 @dataclass(frozen=True, slots=True)
 class MapRegistration:
-    """Registration of a map to a run's track (`tcpipe.terrain.registration`); no shift or scale unless the ground determines it."""
+    """Registration of a map to a track (`tcpipe.terrain.registration`); no shift or scale unless the ground has one."""
 
     run_id: str
     points: int
@@ -322,7 +322,7 @@ class DatasetCard:
     verdict: Verdict
     """By all findings of the dataset, its maps and the runs that have samples."""
     physics: Mapping[str, PhysicsFit] = omit({})
-    """By robot, the physics fitted on train: idle, drivetrain, rolling, grade and turning by class; robots without a fit are omitted."""
+    """Physics fitted on train by robot, if any: idle, drivetrain, rolling, grade and turning by class."""
     covariates: tuple[Covariate, ...] = omit(())
     added_columns: Mapping[str, str] = omit({})
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
@@ -344,7 +344,7 @@ class DatasetCard:
 
     @property
     def plane_crs(self) -> str:
-        """CRS of the plane in which footprints and regions are compared: that of the first map, if there is one; or `LOCAL`."""
+        """CRS of the plane in which footprints and regions are compared: that of the first map, else `LOCAL`."""
         return self.maps[0].crs if self.maps else self.plane
 
     @property
@@ -372,7 +372,7 @@ class InspectedDataset(DatasetCard):
 
 
 def judge_dataset(findings: Iterable[Finding], runs: Iterable[RunSource], maps: Iterable[MapSource]) -> Verdict:
-    """Return the verdict on a dataset, with the worst finding of each code as its reasons; a run without samples changes nothing."""
+    """Return the verdict on a dataset, with the worst finding of each code as reasons, by its runs with samples."""
     of_runs = (finding for run in runs if run.samples for finding in run.findings)
     of_maps = (finding for source in maps for finding in source.findings)
     return judge_by_code([*findings, *of_runs, *of_maps])
@@ -381,7 +381,7 @@ def judge_dataset(findings: Iterable[Finding], runs: Iterable[RunSource], maps: 
 def group_dataset_findings(
     findings: Sequence[Finding], by_run: Mapping[str, Sequence[Finding]], by_map: Mapping[str, Sequence[Finding]] = {}
 ) -> list[tuple[FindingGroup[str], int | None, str]]:
-    """Return all findings of a dataset grouped by code, each group with how many runs or maps there are and the word for them."""
+    """Return all findings of a dataset grouped by code, with the number of runs or maps and the word for them."""
     own = [(finding.subject.name, [finding]) for finding in findings if finding.subject.kind != "run"]
     of_runs = [(finding.subject.name, [finding]) for finding in findings if finding.subject.kind == "run"]
     runs = len({*by_run, *(name for name, _ in of_runs)})

@@ -82,7 +82,7 @@ MOST_PX = 1024
 
 @contextmanager
 def _convert_errors(remedy: str = "") -> Iterator[None]:
-    """Raise a `StoreError`, or the `RecipeError` of the recipe in a card, as `DatasetError`, ``remedy`` added to its lines."""
+    """Raise a `StoreError`, or the `RecipeError` of a card's recipe, as `DatasetError` with ``remedy`` added."""
     try:
         yield
     except (StoreError, RecipeError) as error:
@@ -94,7 +94,7 @@ _AGAIN = "; build the dataset again"
 
 @dataclass(frozen=True, slots=True)
 class Pixels:
-    """Patches to be written: row i of the dataset is what ``read(layer, slots[i : i + 1])`` returns, shape (1, px, px)."""
+    """Patches to write: row i of the dataset is what ``read(layer, slots[i : i + 1])`` returns, shape (1, px, px)."""
 
     layers: Mapping[str, Layer]
     patch_px: int
@@ -214,7 +214,7 @@ def _open_layer_array(
 def make_parquet_writers(
     out: Place, pixels: Pixels, samples: Callable[[Ints], pa.Table], split: NDArray[np.str_]
 ) -> list[Drawer]:
-    """Return ``data/<split>-*.parquet``, to be written to ``out``: the columns of the samples and each layer as a plain fixed-size list.
+    """Write ``data/<split>-*.parquet`` to ``out``: the columns of the samples, and each layer as a fixed-size list.
 
     ``samples`` gives rows of the samples table.
     """
@@ -285,14 +285,14 @@ def read_intact_card(directory: Path) -> DatasetCard:
 
 
 def find_foreign_files(directory: Path, checksums: Collection[str]) -> list[str]:
-    """Return the files in the directory of a dataset that tcpipe did not write; ``checksums`` are the names that its card lists."""
+    """Return the files in a dataset's directory that tcpipe did not write; ``checksums`` are the names in its card."""
     files = (path for path in directory.rglob("*") if path.is_symlink() or not path.is_dir())
     names = {path.relative_to(directory).as_posix() for path in files} - {*checksums, CARD, REPORT}
     return sorted(names)
 
 
 def keep_foreign_files(names: Iterable[str], before: Path, directory: Path) -> None:
-    """Link or copy files of others from the directory of a dataset into the one that replaces it; `DatasetError` if one is there."""
+    """Link or copy a user's files from a dataset into the one that replaces it; `DatasetError` if one exists there."""
     for name in names:
         target = directory / name
         if target.exists():
@@ -320,7 +320,8 @@ def sample_columns(directory: Path) -> list[str]:
 class PatchFiles:
     """Where a dataset's patches lie, piece by piece; a piece is what is decoded together.
 
-    ``starts`` are the first rows of the pieces and, last, the number of rows, shape (P + 1,), in the order of the files.
+    ``starts`` are the first rows of the pieces and, last, the number of rows, shape (P + 1,), in the order of the
+    files.
     """
 
     directory: Path
@@ -446,7 +447,7 @@ _ID_COLUMNS = ("sample_id", "segment_id")
 
 
 def read_sample_ids(path: Path) -> list[str]:
-    """Return the ids of a list, each once, in its order: the column sample_id or segment_id of a CSV file, or the lines of a text.
+    """Return unique ids of a list in order: the column sample_id or segment_id of a CSV file, or the lines of a text.
 
     `DatasetError` if it cannot be read, has other columns or no id.
     """

@@ -9,7 +9,8 @@
 Rules (ADR-36):
 
 1. Bytes whose sha256 does not begin with the digest in their name are no document: they are damaged, or half copied.
-2. For each kind and key the document with the highest number counts; of several with this number, the one with the smallest digest.
+2. For each kind and key the document with the highest number counts; of several with this number, the one with the
+smallest digest.
    A writer uses 1 + the highest number that it saw.
 3. The payload is written first, into a folder with a fresh random name; then the document that names the folder.
 4. A call writes number 1 of its document before it scans, and number 2 when it ends.
@@ -155,7 +156,8 @@ class State:
     def _join_runs(self) -> dict[str, RunFacts]:
         """Return the runs with the tags of their logs, and with the run that supersedes them.
 
-        Of runs of one robot and recipe that begin with the same measurements the longest recording counts whose payload is there.
+        Of runs of one robot and recipe that begin with the same measurements the longest recording counts whose payload
+        is there.
         """
         longest, joined = dict[Beginning, RunFacts](), dict[str, RunFacts]()
         rows: Mapping[str, RunFacts] = self.facts["runs"]

@@ -1,4 +1,4 @@
-"""Findings as lines for people: the one place that turns them into sentences, for the command line, the pages and the documentation."""
+"""Findings as sentences, for the command line, the pages and the documentation."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _SHORT_S = 2.0
 
 
 def format_number(name: str, value: float) -> str:
-    """Return a number with the unit of its name's suffix, with three significant digits; counts and offsets as whole numbers."""
+    """Return a number with the unit in its name's suffix and three significant digits; counts are integers."""
     if name.endswith(("_count", "_offset")):
         return f"{value:.0f}"
     unit, factor = next(
@@ -87,7 +87,7 @@ def describe_finding(finding: Finding) -> str:
 
 
 def describe_remedy(finding: Finding, remedy: Remedy) -> str:
-    """Return what a remedy does and the keys or the command that do it, in one line; of arrays of tables only that they follow."""
+    """Return the action of a remedy with its keys or command in one line; of arrays of tables only that they follow."""
     purpose = _find_purpose(finding.code, remedy)
     what = [f"'{remedy.command}'"] if remedy.command else []
     what += (
@@ -105,7 +105,7 @@ def _find_purpose(code: str, remedy: Remedy) -> str:
 
 
 def list_remedies(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
-    """Return what helps against findings of one code: what it does, and the commands and lines of a recipe that do it; else the advice."""
+    """Return the remedy of findings of one code: its action, commands and recipe lines; else the advice."""
     remedies: list[Remedy] = []
     for remedy in chain.from_iterable(finding.remedies for finding in findings):
         if remedy not in remedies:
@@ -145,7 +145,7 @@ def _build_recipe_fragment(remedy: Remedy) -> RecipeFragment:
 
 
 def format_findings(findings: Iterable[Finding], *, more: str = "") -> list[str]:
-    """Return at most `MOST_LINES` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
+    """Return at most `MOST_LINES` findings as lines, the worst first, then the number of those that ``more`` lists."""
     return format_groups(_make_single_groups(findings), more=more)
 
 
@@ -196,7 +196,7 @@ _PROVES = dict.fromkeys(("slope", "charge"), " (to a factor of three)") | {"seco
 
 
 def _format_size(key: str, numbers: Mapping[str, float]) -> str:
-    """Return `` 172 ± 7 J/m`` or, of several runs, `` 158 to 190 ± 7 J/m``, with the decimals of σ; of a position σ alone."""
+    """Return `` 172 ± 7 J/m`` or, for several runs, `` 158 to 190 ± 7 J/m``, with the decimals of σ."""
     std, suffix = numbers[key], key.removeprefix("std")
     digits = max(-int(np.floor(np.log10(std))), 0) if std > 0.0 else 3
     means = [numbers[name] for name in (f"mean{suffix}", f"most{suffix}") if name in numbers]
@@ -254,7 +254,7 @@ def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[Find
 
 
 def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") -> str:
-    """Return a group as one line, with how many of ``total`` runs it concerns, if given; of one finding alone what was observed."""
+    """Return a group as one line, with its number of runs out of ``total`` if given; of one finding its evidence."""
     findings = group.findings
     if len(group.of) == 1 and len(findings) == 1:
         key, line = next(iter(group.of)), format_finding(findings[0])
@@ -330,7 +330,7 @@ def list_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> li
 
 
 def format_budget(budget: EnergyBudget) -> str:
-    """Return the budget as a sentence: the floor, its causes from the largest, and the floor with power at 20 Hz if that is lower."""
+    """Return the budget as a sentence: the floor, its causes in order, and the floor with power at 20 Hz if lower."""
     names = {"position": "position", "rate": "power rate", "current": "current noise", "voltage": "voltage"}
     shares = {cause: getattr(budget, cause) for cause in CAUSES}
     causes = ", ".join(

@@ -1,4 +1,4 @@
-"""GeoJSON (RFC 7946: always WGS84, lon before lat): polygons such as the regions of a split, and lines such as paths."""
+"""GeoJSON (RFC 7946: WGS84, lon before lat): polygons such as the regions of a split, and lines such as paths."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ def read_regions(path: Path) -> Regions:
     """Read the regions of a split, in WGS84 lon/lat [deg].
 
     Inside (``train_test``) is the union of the polygons, unless features carry the property ``split``: ``train_test``,
-    ``unseen`` or ``exclude``. No other property is interpreted. ``exclude`` may lie over the other two and carves out of them.
+    ``unseen`` or ``exclude``. No other property is interpreted. ``exclude`` may lie over the other two and carves out
+    of them.
 
     One `RegionError` lists all problems.
     """
@@ -166,7 +167,7 @@ def _reject_constant(name: str) -> Json:
 
 
 def _iterate_features(path: Path) -> Iterator[tuple[str, Mapping[str, Json], Json]]:
-    """Yield where, properties and geometry object of every feature of a file; `RegionError` if it is not GeoJSON in WGS84."""
+    """Yield the place, properties and geometry object of every feature; `RegionError` if it is not GeoJSON in WGS84."""
     document = _parse_document(path)
     name, listed = document["type"], document.get("features")
     features: Sequence[Json]
@@ -228,7 +229,7 @@ def _read_geometry(geometry: Json) -> NDArray[np.object_]:
 
 
 def _find_disagreements(path: Path, polygons: Mapping[str, list[BaseGeometry]]) -> Iterator[str]:
-    """Yield the problems of regions together: an extent beyond any site, as of local metres read as degrees, and overlaps."""
+    """Yield problems of regions together: overlaps, and an extent too large for a site (metres read as degrees)."""
     west, south, east, north = shapely.total_bounds([part for parts in polygons.values() for part in parts])
     width_km = (east - west) * np.cos(np.radians(np.clip(0.0, south, north))) * _KM_PER_DEG
     height_km = (north - south) * _KM_PER_DEG
@@ -274,7 +275,7 @@ class LineFeature(Generic[P]):
 
 
 def read_line(path: Path) -> Floats:
-    """Read the path of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2; `PathError` without one, or with several lines."""
+    """Read the path of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2; `PathError` without exactly one line."""
     try:
         features = list(_iterate_features(path))
     except RegionError as error:

@@ -50,7 +50,7 @@ class Checksums:
 
 
 def compute_short_digest(data: bytes) -> str:
-    """Return the first 16 hexadecimal digits of the sha256, which a file carries in its name so that a reader can check it."""
+    """Return the first 16 hexadecimal digits of the sha256, which file names contain for readers to check."""
     return hashlib.sha256(data).hexdigest()[:16]
 
 
@@ -113,7 +113,7 @@ def describe_broken(path: Location) -> str:
 
 
 def find_broken_seal(data: bytes | None, where: Location) -> str | None:
-    """Return in one line why a sealed file (``.json``, ``.html``) at ``where`` is not as it was written; None if it is."""
+    """Return in one line how a sealed file (``.json``, ``.html``) at ``where`` differs from its seal; or None."""
     if data is None:
         return f"{where}: is missing"
     is_whole = _is_whole_page(data) if Path(where).suffix == ".html" else _is_whole_document(data)

@@ -30,7 +30,7 @@ MOST_BYTES = 32 << 20
 
 
 def to_plain(value: Any) -> Any:
-    """Return ``value`` as JSON values: dataclasses become objects, numpy values numbers and lists, what is not finite null."""
+    """Return ``value`` as JSON values: dataclasses become objects, numpy values numbers or lists, NaN and inf null."""
     if is_dataclass(value) and not isinstance(value, type):
         entries = ((entry.name, getattr(value, entry.name), entry.metadata.get("json", ())) for entry in fields(value))
         value = {name: item for name, item, left_out in entries if not (left_out and item in left_out)}
@@ -48,13 +48,13 @@ def to_plain(value: Any) -> Any:
 
 
 def convert_record(record: object, cls: Callable[..., T], **more: object) -> T:
-    """Return a record of another dataclass: with the fields that ``record`` has too, and ``more``, which goes before."""
+    """Return a record of another dataclass, with the fields that ``record`` shares with it; ``more`` has priority."""
     names = (entry.name for entry in fields(cls) if entry.name not in more)  # type: ignore[arg-type]
     return cls(**{name: getattr(record, name) for name in names if hasattr(record, name)}, **more)
 
 
 def to_compact_json(value: object) -> bytes:
-    """Return the JSON of dataclasses whose numbers are finite, for `parse_typed_json`, in a tenth of the time of `to_json_line`."""
+    """Return the JSON of dataclasses with finite numbers, for `parse_typed_json`; faster than `to_json_line`."""
     try:
         return msgspec.json.encode(value)
     except UnicodeEncodeError:  # the name of a file is no text
@@ -62,7 +62,7 @@ def to_compact_json(value: object) -> bytes:
 
 
 def to_json(value: Any) -> str:
-    """Return canonical JSON text: sorted keys, two-space indent, final newline; file names that are no text as escapes."""
+    """Return canonical JSON text: sorted keys, two-space indent, final newline; undecodable file names as escapes."""
     text = json.dumps(to_plain(value), sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
@@ -87,7 +87,7 @@ def read_json(path: Path) -> dict[str, Json]:
 
 
 def read_document(path: Path) -> bytes:
-    """Return the bytes of a JSON file; `StoreError` where it cannot be read, is no file, or larger than `MOST_BYTES`."""
+    """Return the bytes of a JSON file; `StoreError` if it is unreadable, no file, or larger than `MOST_BYTES`."""
     try:
         if path.exists() and not path.is_file():
             raise StoreError(f"{path}: is no file; remove it and run the command again")
@@ -114,12 +114,12 @@ def parse_json(
 
 
 def read_as(path: Path, cls: type[T]) -> T:
-    """Read one JSON object as a dataclass; `StoreError` names a file that cannot be read, or the file and the key of what does not fit."""
+    """Read one JSON object as a dataclass; `StoreError` names a file that cannot be read, or the wrong key in it."""
     return parse_typed(read_json(path), cls, path)
 
 
 def parse_typed(value: object, cls: type[T], path: Location) -> T:
-    """Return a JSON object as a dataclass: a key that it lacks is its default, one that the dataclass lacks is left aside.
+    """Return a JSON object as a dataclass: missing keys have their defaults, and unknown keys are ignored.
 
     `StoreError`: a value is missing, or of another type; the line names ``path`` and the key.
     """
@@ -142,7 +142,7 @@ def parse_typed_json(text: str | bytes | memoryview, cls: type[T], path: Locatio
 
 
 def _format_validation_error(message: str) -> str:
-    """Return what msgspec finds wrong, the key first: of ``Expected `int`, got `str` - at `$.counts.segments``` and such."""
+    """Return msgspec's error, the key first; it reports ``Expected `int`, got `str` - at `$.counts.segments```."""
     what, _, place = message.partition(" - at ")
     key = re.sub(r"^key in ", "", place.strip("`")).removeprefix("$").removeprefix(".")
     if missing := re.fullmatch(r"Object missing required field `(.+)`", what):

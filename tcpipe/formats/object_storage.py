@@ -1,7 +1,7 @@
-"""Logs in object storage (``s3://``, ``gs://``, ``az://``, ``http(s)://``, ``file://``): read by range, or copied to this machine.
+"""Logs in object storage (``s3://``, ``gs://``, ``az://``, ``http(s)://``, ``file://``), read by range or copied.
 
-The home of obstore. Credentials, region and endpoint come from the environment, as the store's own tools take them (``AWS_…``), and from an
-``aws`` profile.
+The home of obstore. Credentials, region and endpoint come from the environment, as the store's own tools take them
+(``AWS_…``), and from an ``aws`` profile.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _PERCENT_ENCODED = ("file", "http", "https")
 _FIRST_S, _FIRST_RETRY_S = 4.0, 1.0
 """The first request of a process waits so long for an answer, and is repeated for so long: a user may be watching."""
 _RETRY_MINUTES = "10"
-"""Time for which obstore repeats later requests [min], unless TCPIPE_RETRY_MINUTES gives another: a store may restart."""
+"""Time for which obstore repeats later requests [min], unless TCPIPE_RETRY_MINUTES is set: a store may restart."""
 _MAX_RETRIES = 10_000
 """More than fit into that time: the time alone decides."""
 _DENIED = (
@@ -183,11 +183,14 @@ def lay_out_objects(
 ) -> Iterator[tuple[Path, dict[Path, StoredObject]]]:
     """Lay out an object, or what is wanted below a prefix, in a temporary directory, until the block ends.
 
-    Yields where it lies, and by path the objects for which there are stand-ins of their size that hold nothing; others are copied.
+    Yields where it lies, and by path the objects for which there are stand-ins of their size that hold nothing; others
+    are copied.
 
-    Objects whose names end as in ``by_range`` get stand-ins of their size that hold nothing; all others that are ``wanted`` are copied.
+    Objects whose names end as in ``by_range`` get stand-ins of their size that hold nothing; all others that are
+    ``wanted`` are copied.
 
-    `LogError`: there is no such object, or it cannot be read; what goes wrong inside the block has the URL in place of the path.
+    `LogError`: there is no such object, or it cannot be read; what goes wrong inside the block has the URL in place of
+    the path.
     """
     shown, query = split_url(url, one_object=True)
     with make_scratch_directory() as directory:
@@ -203,7 +206,7 @@ def lay_out_objects(
 
 
 def make_stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Path:
-    """Lay out what lies at or below a URL as files of the right names, sizes and times that hold nothing and take no room."""
+    """Create placeholders of the objects at or below a URL: empty files of the right names, sizes and times."""
     shown, query = split_url(url, one_object=True)
     _lay_out_stand_ins(shown, query, directory, wanted)
     return _place_of(shown, directory)
@@ -247,9 +250,9 @@ def ask_store(
 ) -> T:
     """Return what a request gives to which an object is ``read`` or ``written``.
 
-    Without an answer the first request of a command fails within 5 s; later ones, and those of worker processes, are repeated for minutes.
-    After one of them has failed, the next ones fail soon, too, until the store answers again. An error is one line; `FileNotFoundError`
-    (no such object) and `AlreadyExistsError` pass.
+    Without an answer the first request of a command fails within 5 s; later ones, and those of worker processes, are
+    repeated for minutes. After one of them has failed, the next ones fail soon, too, until the store answers again. An
+    error is one line; `FileNotFoundError` (no such object) and `AlreadyExistsError` pass.
     """
     from obstore.exceptions import AlreadyExistsError, BaseError  # noqa: PLC0415
 
@@ -353,9 +356,10 @@ _OTHER_CREDENTIALS = (
 
 
 def read_aws_profile(environment: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return the settings of the profile ``AWS_PROFILE``, else ``default``, that the environment does not give, by obstore's names.
+    """Return the settings of the profile ``AWS_PROFILE`` (or ``default``) that are not in the environment.
 
-    `ValueError`: there is no profile of that name, or it has no keys (single sign-on, a role, a program that gives them).
+    `ValueError`: there is no profile of that name, or it has no keys (single sign-on, a role, a program that gives
+    them).
     """
     wanted = environment.get("AWS_PROFILE")
     name, home = wanted or "default", Path(environment.get("HOME", "~")).expanduser() / ".aws"
@@ -393,7 +397,7 @@ def _read_section(path: Path, name: str) -> Mapping[str, str] | None:
 
 @lru_cache(maxsize=64)
 def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], *, is_first: bool) -> ObjectStore:
-    """Return a bucket, directory or server, once for each setting of the environment; a presigned URL's server gets its query."""
+    """Return a bucket, directory or server, one for each setting of the environment; presigned URLs keep the query."""
     import obstore  # noqa: PLC0415
 
     del settings

@@ -1,7 +1,8 @@
 """Tables in files: Parquet with GeoParquet metadata, and Arrow files; the same table gives the same bytes.
 
-Every page carries a checksum that is proved when it is read: damage is an error, never a number. Before a page is decoded, the headers of
-all pages say how large the table becomes: one that is out of proportion to its file is refused (`MOST_BYTES`, `MOST_TIMES`).
+Every page carries a checksum that is proved when it is read: damage is an error, never a number. Before a page is
+decoded, the headers of all pages say how large the table becomes: one that is out of proportion to its file is refused
+(`MOST_BYTES`, `MOST_TIMES`).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _M_MMAP_THRESHOLD = -3
 ROWS_PER_GROUP = 1 << 17
 """Rows of a group: what is decoded together."""
 MOST_BYTES, MOST_TIMES = 256_000_000, 100
-"""A table in memory is at most so large [byte], or so many times its file: constant columns aside, ours shrink to a tenth."""
+"""Largest table in memory [byte], and in multiples of its file: ours shrink to a tenth, except constant columns."""
 _MOST_DEPTH = 4
 """Structs in one another in the header of a page."""
 _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}
@@ -51,7 +52,7 @@ def write_table(table: pa.Table, path: Path) -> None:
 
 @contextmanager
 def write_parquet_rows(path: Path, schema: pa.Schema) -> Iterator[Callable[[pa.Table], None]]:
-    """Yield a function that adds rows to ``path``, each call a row group or more; the file appears at the end, whole or not at all."""
+    """Yield a function that adds row groups to ``path``; the file appears at the end, complete or not at all."""
     with write_atomic_file(path) as temporary, _open_writer(temporary, schema) as writer:
         yield lambda table: writer.write_table(table.combine_chunks(), row_group_size=ROWS_PER_GROUP)
 
@@ -77,7 +78,7 @@ def _open_writer(sink: Path | pa.NativeFile, schema: pa.Schema) -> pq.ParquetWri
 
 
 def make_storable(table: pa.Table) -> pa.Table:
-    """Return the table as Parquet can hold it: messages without fields, in arrays, get the member ROS 2 gives them on the wire, null."""
+    """Return the table for Parquet: messages without fields, in arrays, get ROS 2's placeholder member, null."""
     for at, field in enumerate(table.schema):
         wanted = _add_struct_member(field.type)
         if wanted != field.type:
@@ -106,19 +107,19 @@ def _convert_damage(where: Location) -> Iterator[None]:
 
 
 def read_table(path: Path, columns: list[str] | None = None, *, group: int | None = None) -> pa.Table:
-    """Read a Parquet file with its schema metadata, or one of its row groups; `StoreError` names a file that cannot be read."""
+    """Read a Parquet file with its schema metadata, or one of its row groups; `StoreError` names an unreadable file."""
     with _convert_damage(path), pa.memory_map(str(path)) as file:
         return _read_bounded(file.read_buffer(), columns, group)
 
 
 def read_parquet_bytes(data: bytes, where: str) -> pa.Table:
-    """Read the content of a Parquet file that `write_parquet_bytes` made; `StoreError` names one that cannot be read."""
+    """Read the content of a Parquet file from `write_parquet_bytes`; `StoreError` names one that cannot be read."""
     with _convert_damage(where), pq.ParquetFile(pa.BufferReader(data)) as file:
         return file.read()
 
 
 def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None) -> pa.Table:
-    """Return columns of a file, or of one of its row groups, once they are known to be in proportion to it; `ValueError` if not."""
+    """Return columns of a file or row group if their size is in proportion to it; else `ValueError`."""
     about = pq.read_metadata(pa.BufferReader(data))
     most = max(MOST_BYTES, MOST_TIMES * data.size)
     groups = [n for n in range(about.num_row_groups) if group in (None, n) and about.row_group(n).num_rows]
@@ -155,7 +156,8 @@ def _iterate_column_sizes(
 ) -> Iterator[tuple[str, int, int]]:
     """Yield each column of each row group and how large it becomes [byte], by the headers of its pages.
 
-    The first size is that of a column of texts whose dictionary is kept, the second if each text were all of the dictionary.
+    The first size is that of a column of texts whose dictionary is kept, the second if each text were all of the
+    dictionary.
     """
     leaves = [about.schema.column(index) for index in range(about.num_columns)]
     for number in groups:
@@ -175,7 +177,7 @@ def _iterate_column_sizes(
 
 
 def _iterate_pages(data: memoryview, chunk: pq.ColumnChunkMetaData) -> Iterator[tuple[int, int, bool]]:
-    """Yield of every page of a column its size without compression [byte], its values, and whether these are the dictionary."""
+    """Yield the uncompressed size [byte] of each page of a column, its values, and whether they are the dictionary."""
     at = min(chunk.data_page_offset, chunk.dictionary_page_offset or chunk.data_page_offset)
     end = at + chunk.total_compressed_size
     if not 0 < at <= end <= len(data):
@@ -240,7 +242,7 @@ def read_column_names(path: Path) -> list[str]:
 
 
 def read_schema(path: Path) -> pa.Schema:
-    """Return the schema of a Parquet file, with its metadata, from its footer; `StoreError` names a file that cannot be read."""
+    """Return a Parquet file's schema with its metadata, from the footer; `StoreError` names an unreadable file."""
     with _convert_damage(path):
         return pq.read_schema(path)
 
@@ -280,7 +282,8 @@ def add_geo_metadata(
 ) -> pa.Table:
     """Return a table whose metadata says what its column ``geometry`` holds.
 
-    ``points_deg`` are longitude and latitude of all points, shape (N, 2), NaN where not known; longitude is first whatever ``crs`` says.
+    ``points_deg`` are longitude and latitude of all points, shape (N, 2), NaN where not known; longitude is first
+    whatever ``crs`` says.
     """
     known = points_deg[np.isfinite(points_deg).all(axis=1)]
     column: dict[str, Any] = {"encoding": "WKB", "geometry_types": [kind]}
@@ -322,7 +325,7 @@ def take_rows(table: pa.Table, rows: Ints) -> pa.Table:
 
 
 def make_mapped_array(directory: Path, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return an array of zeros in a nameless file in a directory: the system may put its pages aside, so it takes no memory."""
+    """Return an array of zeros in a nameless file in a directory, so that the system can free its memory."""
     size_bytes = np.dtype(dtype).itemsize * math.prod(shape)
     if not size_bytes:
         return np.zeros(shape, dtype)

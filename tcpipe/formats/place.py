@@ -1,8 +1,9 @@
 """Files of a store or of an output, in a directory or below the URL of a bucket (ADR-36).
 
-A name is relative, with ``/`` between its parts. A file appears whole (on disk: synced) or not at all; a folder appears whole on disk, and
-file by file in a bucket: readers look into a folder only after a document that names it. Nothing here needs locks, clocks or put-if-absent.
-On disk each method has its own code: obstore's store for local directories syncs nothing and does not list temporaries of killed writers.
+A name is relative, with ``/`` between its parts. A file appears whole (on disk: synced) or not at all; a folder appears
+whole on disk, and file by file in a bucket: readers look into a folder only after a document that names it. Nothing
+here needs locks, clocks or put-if-absent. On disk each method has its own code: obstore's store for local directories
+syncs nothing and does not list temporaries of killed writers.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def is_desktop_file(name: str) -> bool:
 
 
 class FileEntry(NamedTuple):
-    """A file at a place: its name there, its size [byte], and its modification time [ns] by the clock of the disk or bucket."""
+    """A file at a place: its name, its size [byte], and its modification time [ns] by the disk's or bucket's clock."""
 
     name: str
     size_bytes: int
@@ -63,7 +64,7 @@ class FileEntry(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A directory, or a prefix of a bucket; every method raises `StoreError`, in one line, if it cannot read or write."""
+    """A directory, or a prefix of a bucket; every method raises a one-line `StoreError` if it cannot read or write."""
 
     root: Location
     staging: Path | None = None
@@ -96,7 +97,7 @@ class Place:
         return run_side_by_side(function, items) if self.path is None else list(map(function, items))
 
     def read(self, name: str) -> bytes | None:
-        """Return a whole file; None if it does not exist. On disk it is a `StoreError` if it is larger than any document or page."""
+        """Return a whole file; None if it does not exist. On disk, `StoreError` if it exceeds any document or page."""
 
         def read(path: Path) -> bytes:
             if path.stat().st_size <= _MAX_BYTES:
@@ -137,7 +138,7 @@ class Place:
         return tag if tag is None or self.path else f"{self.where(name)} {tag}"
 
     def list(self, folder: str = "") -> _List[str]:
-        """Return the names of files and folders directly in a folder, sorted, without temporaries; a bucket lists 1000 per request."""
+        """Return sorted names of files and folders in a folder, without temporaries (1000 per request to a bucket)."""
 
         def list_objects(store: ObjectStore, key: str) -> _List[str]:
             found = store.list_with_delimiter(key or None)
@@ -149,7 +150,7 @@ class Place:
         return []
 
     def entries(self, prefix: str = "") -> _List[FileEntry]:
-        """Return all files below ``prefix/``, however deep, sorted by name, without temporaries; a bucket lists 1000 per request."""
+        """Return all files below ``prefix/``, sorted by name, without temporaries; a bucket lists 1000 per request."""
 
         def list_objects(store: ObjectStore, key: str) -> _List[FileEntry]:
             cut = len(self._key("x")) - 1
@@ -173,7 +174,7 @@ class Place:
         return atomic.make_scratch_directory() if self.path is None else atomic.make_working_directory(self._top)
 
     def put_files(self, prefix: str, directory: Path) -> None:
-        """Put all files of a directory in a `workshop` below ``prefix/``, a name that is not in use; the directory is used up."""
+        """Move all files of a directory in a `workshop` below ``prefix/``, an unused name; the directory is used up."""
         if self.path is not None:
             atomic.put_directory(directory, self._at(prefix))
             return
@@ -187,7 +188,8 @@ class Place:
     def fetch(self, name: str, checksum: Checksum, *, proved: bool = True) -> Path:
         """Return a file of this machine with the content of ``name``: itself, or a copy in the cache.
 
-        A file that is ``proved`` is hashed now, and an altered copy is fetched again. `StoreError`: the file has another content.
+        A file that is ``proved`` is hashed now, and an altered copy is fetched again. `StoreError`: the file has
+        another content.
         """
 
         def copy(to: Path) -> None:
@@ -267,7 +269,7 @@ _READS_AT_ONCE = 4
 
 
 def find_wrong_files(place: Place, checksums: Mapping[str, Checksum | None]) -> Iterator[str]:
-    """Yield a line for every file at a place that differs from its checksum (None: not on record); each is read in place."""
+    """Yield a line for every file that differs from its checksum (None: not on record); each is read at its place."""
     for name, wanted in checksums.items():
         try:
             line = _check_size(place, name, wanted)

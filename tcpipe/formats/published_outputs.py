@@ -1,12 +1,13 @@
-"""Datasets, models, cost maps and evaluations at a URL: each build is a folder, and one pointer names the newest (ADR-36).
+"""Datasets, models, cost maps and evaluations at a URL: each build is a folder, and a pointer names the newest.
 
 ::
 
     builds/6d0c3c1b9a0e4f27/            the files of a build, in a folder with a random name
     current.2.1f0c8a3be2d94c57.json     the pointer of the second build: its folder, and the name of its card
 
-A pointer is written after the files and never changed. The highest number counts, then the smallest digest; bytes whose sha256 does not
-begin with the digest in their name are no pointer. Files at a URL without a pointer, as a copy put them there, are read as they are.
+A pointer is written after the files and never changed. The highest number counts, then the smallest digest; bytes whose
+sha256 does not begin with the digest in their name are no pointer. Files at a URL without a pointer, as a copy put them
+there, are read as they are.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class FoundCard(NamedTuple):
 
 
 def find_newest(url: str, cards: Sequence[str]) -> FoundCard | None:
-    """Return the card of the newest build at a URL, in three requests; None for another kind than ``cards``, or without a build."""
+    """Return the card of the newest build at a URL, in three requests; None without a build of a kind in ``cards``."""
     place = open_place(url)
     if not is_bucket(url):  # without lists
         return _find_card(place, cards)
@@ -126,7 +127,7 @@ def write_output(url: str, card: str) -> Iterator[Path]:
 
 @contextmanager
 def open_output(out: Location, card: str) -> Iterator[Path]:
-    """Yield the directory to write an output into: ``out`` itself, or of a URL one whose files become its newest build."""
+    """Yield the directory for an output: ``out`` itself or, for a URL, one whose files become its newest build."""
     if not is_url(out):
         yield Path(out)
         return
@@ -136,7 +137,7 @@ def open_output(out: Location, card: str) -> Iterator[Path]:
 
 @contextmanager
 def publish_directory(out: Location, card: str) -> Iterator[Path]:
-    """Yield an empty directory whose files, a card among them, become ``out`` at the end, or the newest build at a URL."""
+    """Yield an empty directory whose files, including a card, become ``out``, or the newest build at a URL."""
     with (
         write_output(str(out).rstrip("/"), card)
         if is_url(out)
@@ -146,7 +147,7 @@ def publish_directory(out: Location, card: str) -> Iterator[Path]:
 
 
 def find_unlisted_files(url: str) -> list[str]:
-    """Return the files at a URL that no card there lists, without those of replaced builds and of builds that may be going on."""
+    """Return the files at a URL that no card lists, without those of replaced and perhaps unfinished builds."""
     place = open_place(url)
     entries = place.entries()
     pointers = list(_iterate_pointers(place, [entry.name for entry in entries]))
@@ -179,7 +180,7 @@ def _iterate_pointers(place: Place, names: Iterable[str]) -> Iterator[_Pointer]:
 
 
 def _find_expired(entries: Sequence[FileEntry], pointers: Sequence[_Pointer]) -> list[str]:
-    """Return pointers and folders that have not been in use for seven days; the bucket's own times of modification decide."""
+    """Return pointers and folders that were not in use for seven days, by the bucket's times of modification."""
     if not pointers:
         return []
     times, ages = {entry.name: entry.modified_ns for entry in entries}, dict[str, int]()
@@ -198,7 +199,7 @@ _CRC_BYTES = 4
 
 @dataclass(frozen=True, slots=True)
 class FetchedShards:
-    """Shards in a bucket, of a dataset or a map, below ``root`` as if they were there; pieces are fetched by range, and cached."""
+    """Shards of a dataset or map in a bucket, as if they were below ``root``; pieces are fetched by range, cached."""
 
     place: Place
     root: Path
@@ -212,7 +213,7 @@ class FetchedShards:
         return self._checksum(path).size_bytes
 
     def read(self, path: Path, offset: int, size: int) -> bytes:
-        """Return a piece of a shard that ends with the CRC-32C of the rest; an altered copy in the cache is fetched again."""
+        """Return a piece of a shard that ends with the CRC-32C of the rest; a changed cached copy is fetched again."""
         self._prove({self._name(path)})
         for _ in range(2):
             held = self._held(path, offset, size)
@@ -264,7 +265,7 @@ class FetchedShards:
 
 
 def fetch_directory(path: Location) -> Path:
-    """Return a directory of this machine: the one that is named, or a copy, for this process, of the files that a card in a bucket lists.
+    """Return a local directory: the given one, or a copy of the files in a bucket's card for this process.
 
     `UsageError`: there is no card at the URL; `StoreError`: it cannot be read, or a file differs from its checksum.
     """
@@ -272,7 +273,7 @@ def fetch_directory(path: Location) -> Path:
 
 
 def fetch_directory_by_range(path: Location, *, by_range: Callable[[str], bool]) -> tuple[Path, FetchedShards | None]:
-    """Return a directory as `fetch_directory`, without the files that are ``by_range``, and where these are read; None on this machine."""
+    """Return a directory as `fetch_directory` without the files ``by_range``, and where these are; None if local."""
     if not is_url(path):
         return Path(path), None
     url = str(path).rstrip("/")
@@ -287,9 +288,10 @@ def fetch_directory_by_range(path: Location, *, by_range: Callable[[str], bool])
 def fetch_files(
     place: Place, checksums: Mapping[str, Checksum], *, by_range: Callable[[str], bool]
 ) -> tuple[Path, FetchedShards | None]:
-    """Return a directory of this machine with the files of a place but those that are ``by_range``, and where these are read.
+    """Return a local directory with a place's files except those ``by_range``, and where these are read.
 
-    A directory has all of them: it is returned itself, with None. `StoreError`: a file is missing or differs from its checksum.
+    A directory has all of them: it is returned itself, with None. `StoreError`: a file is missing or differs from its
+    checksum.
     """
     if place.path is not None:
         return place.path, None
@@ -316,7 +318,7 @@ def _fetch_others(
 
 @cache
 def _make_copy_directory(url: str, version: bytes) -> Path:
-    """Return a directory that is removed when the process ends; its path ends with the URL, for messages about its files."""
+    """Return a directory that is removed when the process ends; its path ends with the URL, as messages need it."""
     del version
     path = make_lasting_scratch().joinpath(*(part for part in url.split("/") if part not in ("", "..")))
     path.mkdir(parents=True, exist_ok=True)

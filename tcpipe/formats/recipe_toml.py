@@ -1,4 +1,4 @@
-"""TOML files: recipes, found, read, checked (all errors at once) and written with comments; the robot profiles of the package."""
+"""TOML files: recipes, read, checked (all errors together) and written with comments; the package's robot profiles."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _OWN_TABLES = ("robots", "power_sources", "tables")
 
 
 def find_recipe(explicit: Path | None, directory: Path) -> Path | None:
-    """Return the recipe that rules: the one given, ``TCPIPE_RECIPE``, the nearest tcpipe.toml upward, or none (defaults)."""
+    """Return the recipe in use: the given one, ``TCPIPE_RECIPE``, the nearest tcpipe.toml upward, or the defaults."""
     if explicit is not None:
         return explicit
     if os.environ.get("TCPIPE_RECIPE"):
@@ -39,7 +39,7 @@ def find_recipe(explicit: Path | None, directory: Path) -> Path | None:
 
 
 def load_recipe(path: Path | None) -> Recipe:
-    """Read and check a recipe; without a path return the defaults. `RecipeError` carries one line for every wrong key."""
+    """Read and check a recipe; without a path return the defaults. `RecipeError` has one line for every wrong key."""
     if path is None:
         return Recipe()
     try:
@@ -69,7 +69,7 @@ def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
 
 
 def ingest_key(recipe: Recipe | Mapping[str, Json]) -> str:
-    """Return the hash (hex) of what rules a run's files in a recipe or in what a manifest holds of one; the dataset's sections do not."""
+    """Return the hash (hex) of the keys of a recipe, or of a manifest's part of it, that affect a run's files."""
     if not isinstance(recipe, Recipe):
         return _hash_values(recipe)
     known = _KEYS.get(id(recipe))
@@ -81,7 +81,7 @@ def ingest_key(recipe: Recipe | Mapping[str, Json]) -> str:
 
 
 _KEYS: dict[int, tuple[Recipe, str]] = {}
-"""The last recipe and its key: a thousand logs ask for the key of the same one. The recipe is kept, so that no other has its id."""
+"""The last recipe and its key, since many logs ask for the same one; the recipe is kept so that its id stays unique."""
 
 
 def _hash_values(values: Mapping[str, Json]) -> str:
@@ -91,7 +91,7 @@ def _hash_values(values: Mapping[str, Json]) -> str:
 
 
 def read_key(recipe: Recipe | IngestSections, robot: str | None, *, definitions: str) -> str:
-    """Return the hash (hex) of what rules the streams beside the log: the read section, the robot asked for, the definitions given."""
+    """Return the hash (hex) of what determines the streams of a log: read section, robot, given definitions."""
     own = {name: values for name in _OWN_TABLES if (values := getattr(recipe, name))}
     return digest({"read": recipe.read, "robot": robot, "definitions": definitions, **own})
 
@@ -156,7 +156,7 @@ _MOST_DOTS = 1000
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the values of a TOML document; `ValueError` for other text, too deep nesting, or a line with too many dots."""
+    """Return the values of a TOML document; `ValueError` for other text, deep nesting, or a line with many dots."""
     for number, line in enumerate(text.splitlines(), 1):
         if (dots := line.count(".")) > _MOST_DOTS:
             raise ValueError(f"line {number} has {dots} dots, at most {_MOST_DOTS}")

@@ -37,7 +37,7 @@ Options: TypeAlias = Mapping[str, str | int | float | bool | list[str] | dict[st
 
 @dataclass(frozen=True, slots=True)
 class LogSnapshot:
-    """A log when it was seen: its files, the size [byte] and modification time [ns] of each, and the hash of its content."""
+    """A log when it was found: its files, each one's size [byte] and modification time [ns], and its content's hash."""
 
     log: tuple[str, ...]
     size_and_time: tuple[tuple[int, int], ...]
@@ -195,9 +195,9 @@ class LogOrigin:
     sha256: str
     size_bytes: int = 0
     sha256_of: Literal["log", "index"] = "log"
-    """Data that was hashed: the whole log, or, if only part of it was downloaded, the sizes and indexes of its files."""
+    """Hashed data: the whole log, or the sizes and indexes of its files if only part of it was downloaded."""
     outline: str = ""
-    """Hash of the size and index of the log, by which it is known where not all of it is at hand; "" where it has none."""
+    """Hash of the size and index of the log, which identifies it if it is not all local; "" without an index."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +222,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """When a log was recorded, and what identifies its beginning: a longer log with the same beginning supersedes it."""
+    """Recording time of a log, and the identity of its beginning: a longer log with the same one supersedes it."""
 
     first_ns: int
     """Stamp of the first measurement [ns since 1970]."""
@@ -272,7 +272,7 @@ class RunFacts:
     energy_budget: EnergyBudget | None = None
     idle_watt: float | None = None
     physics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Terms of the fit of power with their standard deviations, in SI, by ``term`` or, for one terrain class, ``term on terrain``."""
+    """Terms of the power fit with standard deviations, in SI, by ``term`` or, for one class, ``term on terrain``."""
     blob: str
     """Folder of its tables; "" of a run whose tables were pruned."""
     tables: Mapping[str, Checksum]

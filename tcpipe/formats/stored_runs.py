@@ -67,7 +67,7 @@ class StoredRun:
         return self.folder.fetch(name, checksum)
 
     def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
-        """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
+        """Read ``track``, ``segments`` or ``rejections``, or columns of it; `StoreError` if it was changed."""
         columns = None if columns is None else list(columns)
         return read_table(self.file(f"{name}.parquet"), columns).replace_schema_metadata(None)
 
@@ -171,7 +171,7 @@ class _LentTables(Mapping[str, pa.Table]):
 
 
 def lend_streams(streams: Streams, files: Mapping[str, Path]) -> Streams:
-    """Return L1 with large tables that are read from ``files`` at each access, and not kept in memory between accesses."""
+    """Return L1; large tables are read from ``files`` at each access and are not kept in memory in between."""
     held = {role: table for role, table in streams.tables.items() if role not in _LENT}
     return replace(streams, tables=_LentTables(held, {role: path for role, path in files.items() if role in _LENT}))
 
@@ -232,7 +232,7 @@ def _is_payload(name: str) -> bool:
 
 
 def read_records(place: Place, state: State, but: Collection[str] = ()) -> tuple[list[RunFacts | StoredMap], list[str]]:
-    """Return the runs and maps in all documents, also those that do not count, without some, and the names of damaged documents."""
+    """Return runs and maps in all documents (superseded ones too) without some, and the names of damaged documents."""
     counting = [(name, state.facts[kind][key]) for (kind, key), name in state.names.items() if kind in ("runs", "maps")]
     records: list[RunFacts | StoredMap] = [record for name, record in counting if name not in but]
     damaged = [name for name in state.damaged if name.startswith(("runs/", "maps/"))]

@@ -1,8 +1,8 @@
 """Zarr v3 groups of arrays, for maps and datasets: the one home of zarr.
 
-Arrays are cut into small *chunks* (the unit that is decoded) packed into large *shards* (the unit that is a file), compressed by
-zstd; numbers wider than a byte are bit-shuffled first, which halves them. Every chunk carries a checksum that is proved when it is
-read: damage is an error, never a number.
+Arrays are cut into small *chunks* (the unit that is decoded) packed into large *shards* (the unit that is a file),
+compressed by zstd; numbers wider than a byte are bit-shuffled first, which halves them. Every chunk carries a checksum
+that is proved when it is read: damage is an error, never a number.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Compression = Literal["zstd", "lz4"]
 
 
 def create_group(path: Path, attributes: Mapping[str, Any] | None = None) -> zarr.Group:
-    """Create an empty group at ``path``: inside an `atomic.atomic_directory`, so that it appears only when it is complete."""
+    """Create an empty group at ``path``: inside `atomic.atomic_directory`, so that it appears only when complete."""
     import zarr  # noqa: PLC0415  slow to import, and only needed to write
 
     try:
@@ -86,7 +86,7 @@ def add_array(
 
 
 def consolidate_metadata(group: zarr.Group) -> None:
-    """Gather the descriptions of all arrays in the group's own, so that xarray opens it in one read and without a warning."""
+    """Gather the descriptions of all arrays in the group's, so that xarray opens it in one read without a warning."""
     import zarr  # noqa: PLC0415  slow to import, and only needed to write
 
     with warnings.catch_warnings():
@@ -137,7 +137,7 @@ class ShardedArray:
     _indices: dict[tuple[int, ...], NDArray[np.uint64]] = field(default_factory=dict)
 
     def chunk(self, index: tuple[int, ...], out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return a chunk, whole even where the array ends inside it: shape ``chunk_shape``; in ``out``, contiguous, where it is given."""
+        """Return a whole chunk even at the array's end, shape ``chunk_shape``; in ``out`` (contiguous) if given."""
         shard, place = self._shard_and_place(index)
         out = np.empty(self.chunk_shape, self.dtype) if out is None else out
         path = self._shard_path(shard)
@@ -156,7 +156,7 @@ class ShardedArray:
         return out
 
     def expect(self, indices: Iterable[tuple[int, ...]]) -> None:
-        """Fetch remote chunks that will be read soon; a chunk that cannot be fetched raises its error when it is read."""
+        """Fetch remote chunks that will be read soon; one that cannot be fetched raises its error when it is read."""
         if self.fetched is None:
             return
         wanted = [self._shard_and_place(index) for index in indices]
@@ -194,7 +194,7 @@ class ShardedArray:
         return out
 
     def encoded_shard(self, values: NDArray[Any], *, threads: int = 1) -> bytes:
-        """Return the file of a shard that holds ``values`` from its corner on; what they leave of its last chunks is fill value.
+        """Return the file of a shard with ``values`` at its corner; the rest of its last chunks is fill value.
 
         ``threads`` encode chunks side by side; the bytes do not depend on their number.
         """
@@ -246,7 +246,7 @@ class ShardedArray:
         return self._indices[shard]
 
     def _read(self, path: Path, offset: int, size: int) -> bytes:
-        """Read so many bytes, the last of which are a checksum, and return the others; `ValueError` if it does not agree."""
+        """Read bytes, the last of which are a checksum, and return the others; `ValueError` if it does not agree."""
         found = (self.fetched or _LocalShards).read(path, offset, size)
         content = found[:-_CRC_BYTES]
         if _compute_crc(content) != found[-_CRC_BYTES:]:
@@ -270,7 +270,7 @@ def open_sharded(
     sparse: bool = False,
     fetched: FetchedShards | None = None,
 ) -> ShardedArray:
-    """Return the array in ``path``, whose numbers come from a card; of its description, ``zarr.json``, only the compression is used.
+    """Return the array in ``path``, with the numbers of a card; of ``zarr.json`` only the compression is used.
 
     `StoreError`: there is no description, or another compression than tcpipe writes.
     """

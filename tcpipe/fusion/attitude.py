@@ -1,8 +1,8 @@
-"""Attitude of a pose that another program estimated (LIO, SLAM, motion capture), in the ENU plane and in the axes of the robot.
+"""Attitude of a pose from another program (LIO, SLAM, motion capture), in the ENU plane and in robot axes.
 
-A pose gives position and attitude of its sensor in one frame. Where the frame lies in a CRS, its axes are those of the grid: the positions
-in both frames show the angle between them. A sensor that nothing places is turned as the motion shows it: the robot drives forward, and is
-upright on the whole.
+A pose gives position and attitude of its sensor in one frame. Where the frame lies in a CRS, its axes are those of the
+grid: the positions in both frames show the angle between them. A sensor that nothing places is turned as the motion
+shows it: the robot drives forward, and is upright on the whole.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ def add_attitude(
     ----------
     fixes : positions of a pose in the ENU plane.
     frame_m : [m], shape (N, 2), the same positions in the frame of the pose.
-    quat_xyzw, variance_rad2 : frame_from_sensor, shape (N, 4), and its variance about the frame's axes, shape (N, 3); NaN where unknown.
+    quat_xyzw, variance_rad2 : frame_from_sensor, shape (N, 4), and its variance about the frame's axes, shape (N, 3);
+    NaN where unknown.
     mounting_xyzw : base_link_from_sensor.
     """
     known = np.isfinite(quat_xyzw).all(1)
@@ -64,16 +65,16 @@ def add_attitude(
 
 
 def compute_turns(quat_xyzw: Floats, rows: int = 1) -> Floats:
-    """Return the rotation vectors [rad], shape (N - rows, 3), from each attitude to that so many rows later, in the axes of the first."""
+    """Return rotation vectors [rad], shape (N - rows, 3), from each attitude to that ``rows`` later, in its axes."""
     return rotation_vector_from_quat(multiply(invert(quat_xyzw[:-rows]), quat_xyzw[rows:]))
 
 
 def align_mounting(fixes: Positions, odometry: BodyVelocities | None, *, is_stated: bool) -> Positions:
     """Return positions with the attitude of a robot that drives along its x axis, as the odometry tells its sign.
 
-    Where the mounting is stated, only if the motion contradicts it; else without attitude where the robot hardly drives. Source: the TRIAD
-    method, with the direction of motion first and the vertical second (H. D. Black, "A passive system for determining the attitude of a
-    satellite", AIAA Journal 2 (7), 1964).
+    Where the mounting is stated, only if the motion contradicts it; else without attitude where the robot hardly
+    drives. Source: the TRIAD method, with the direction of motion first and the vertical second (H. D. Black, "A
+    passive system for determining the attitude of a satellite", AIAA Journal 2 (7), 1964).
     """
     if fixes.quat_xyzw is None:
         return fixes

@@ -1,9 +1,9 @@
-"""Explain contradictions between sensors by changes: fixes step, an antenna moves, a clock steps, a scale or bias changes.
+"""Explain contradictions between sensors by changes: steps of fixes or clocks, moved antennas, scales, biases.
 
-A change makes one block of the state uncertain at a tick, and again where it ends. `passes.smooth_section` finds when, by the log
-evidence of such an impulse at every tick. A step of fixes makes them uncertain on both sides, since nothing shows which side is right.
-Errors may also be larger than usual throughout. Sets of changes are compared by the likelihood of all measurements, in which a
-measurement beyond the gate counts as the gate, less a cost by kind.
+A change makes one block of the state uncertain at a tick, and again where it ends. `passes.smooth_section` finds when,
+by the log evidence of such an impulse at every tick. A step of fixes makes them uncertain on both sides, since nothing
+shows which side is right. Errors may also be larger than usual throughout. Sets of changes are compared by the
+likelihood of all measurements, in which a measurement beyond the gate counts as the gate, less a cost by kind.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ POSSIBLE = (
 class EventKind:
     """Errors that an event changes, each with the standard deviation of the change, in its unit.
 
-    ``cost``: log of how unlikely it is beforehand [nat]. ``least``: norm of the change of its first three errors; what is smaller is noise.
+    ``cost``: log of how unlikely it is beforehand [nat]. ``least``: norm of the change of its first three errors; what
+    is smaller is noise.
     """
 
     block: tuple[tuple[int, float], ...]
@@ -89,7 +90,7 @@ LARGER_ERRORS: Mapping[tuple[str, int], tuple[float, ...]] = {
     ("varies", Kind.VISUAL): (0.05, 0.1, 0.2),
     ("accelerometer", Kind.STATIONARY_RATE): (0.1, 0.3, 1.0),  # m/s²: its bias follows speed or temperature
 }
-"""Errors that may be larger than usual throughout a section, by their name and sensor, and the sizes that are tried [their unit], 1σ."""
+"""Errors that may be larger than usual in a section, by name and sensor, and the tried sizes [their unit], 1σ."""
 _VARIES_S = 5.0
 """Correlation time of a scale or a bias that varies [s]."""
 _REJECTED_S: Mapping[int, float] = {Kind.FIX: 1.0, Kind.WHEELS: 4.0, Kind.VISUAL: 4.0, Kind.ATTITUDE: 4.0}
@@ -100,7 +101,8 @@ _REJECTED_S: Mapping[int, float] = {Kind.FIX: 1.0, Kind.WHEELS: 4.0, Kind.VISUAL
 class Change:
     """One change: its kind, the sensor it is of, and its first and last tick (None: to the end of the section).
 
-    ``size``: how large it is, in the unit of what changes. ``impulse``: by how much the errors of its block change, and its deviation.
+    ``size``: how large it is, in the unit of what changes. ``impulse``: by how much the errors of its block change, and
+    its deviation.
     """
 
     kind: str
@@ -172,7 +174,7 @@ class Hypothesis:
         return ticks
 
     def alter_priors(self, std: Floats, walk: Floats, time_s: Floats) -> None:
-        """Alter standard deviation, walk and correlation time of every error, shapes (45,), to those under all changes."""
+        """Change standard deviation, walk and correlation time of all errors, (45,), to those with all changes."""
         offset = slice(Error.FIX_OFFSET, Error.FIX_OFFSET + 3)
         for change in self.changes:
             if change.kind in {"step", "slow"}:  # either side of a step may be right: both are off by half of it, 1σ
@@ -201,8 +203,8 @@ def is_contradicted(tests: Tests, period_s: float) -> bool:
 def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
     """Return the measurements of ticks without outliers, shape (K, 9, 3).
 
-    A spike among its neighbours is an outlier, and so is a rejected measurement, except in a long run of rejections, which a change may
-    explain.
+    A spike among its neighbours is an outlier, and so is a rejected measurement, except in a long run of rejections,
+    which a change may explain.
     """
     value = ticks.inputs.value.copy()
     for kind in (Kind.WHEELS, Kind.VISUAL, Kind.FIX):
@@ -222,7 +224,7 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
 
 
 def _find_long_runs(rows: Ints, mask: NDArray[np.bool_], period_s: float, kind: int) -> list[tuple[int, int]]:
-    """Return the runs of true measurements at some ticks, first and last row, that last longer than a right sensor may be rejected.
+    """Return runs of true measurements, first and last row, that last longer than a correct sensor is rejected.
 
     The last row is excluded. Fewer than five rows are single outliers.
     """
@@ -233,7 +235,7 @@ def _find_long_runs(rows: Ints, mask: NDArray[np.bool_], period_s: float, kind: 
 
 
 def join_events(events: Sequence[Change]) -> tuple[Change, ...]:
-    """Return changes by events that were found one after the other: one that undoes another ends it, an offset that stays is a step."""
+    """Return changes by events in the order found: an event that undoes another ends it; a lasting offset is a step."""
     single: list[Change] = []
     for event in sorted(events, key=lambda each: (each.kind, each.role, each.first)):
         before = single[-1] if single and (single[-1].kind, single[-1].role) == (event.kind, event.role) else None
@@ -267,8 +269,8 @@ _EXCURSION_WINDOW_S = 8.0
 def find_excursions(residuals: Sequence[Residuals], noise: NoiseModel, ticks: Ticks) -> tuple[Change, ...]:
     """Return the spans in which fixes moved otherwise than two odometries alike, far beyond the noise of the section.
 
-    A step at t is beyond in every window that holds t, an excursion only in windows as long as itself: where short windows are farther
-    beyond, there is a step.
+    A step at t is beyond in every window that holds t, an excursion only in windows as long as itself: where short
+    windows are farther beyond, there is a step.
     """
     size = ticks.stamp_ns.size
     of_fixes = [each for each in residuals if GNSS in each.pair and each.time_s > 4.0]
@@ -291,7 +293,7 @@ def find_excursions(residuals: Sequence[Residuals], noise: NoiseModel, ticks: Ti
 def _find_excursion_runs(
     one: Residuals, other: Residuals, noise: NoiseModel
 ) -> Iterator[tuple[float, float, int, int, float]]:
-    """Yield z², length [s], start and end [ns] and size [m] of each run of windows that both pairs of sensors contradict alike."""
+    """Yield z², length [s], start and end [ns] and size [m] of each run of windows that both pairs contradict alike."""
     if one.axis not in {ALONG, ACROSS} or one.axis != other.axis or abs(one.time_s / other.time_s - 1.0) > 0.1:
         return
     start_ns, *rows = np.intersect1d(one.start_ns, other.start_ns, return_indices=True)

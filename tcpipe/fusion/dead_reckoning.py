@@ -26,7 +26,7 @@ MIN_SPEED_MPS = 0.2
 
 @dataclass(frozen=True, slots=True)
 class DeadReckoning:
-    """The path from the origin, along the real axis at time zero, as a function of time; speeds are held outside their samples.
+    """The path from the origin, first along the real axis, as a function of time; speeds are held at the ends.
 
     Attributes
     ----------
@@ -87,10 +87,11 @@ _GRID_S = 0.5
 
 
 def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_ns: int) -> tuple[Floats, Floats]:
-    """Return how fast the course over ground turns: stamps [s] from ``zero_ns`` on, twice a second at most, and rates [rad/s].
+    """Return the turn rate of the course over ground: stamps [s] from ``zero_ns``, at most two a second, rates [rad/s].
 
-    The course is that of the displacement over a second, or over as many as it takes to exceed the noise of the fixes; in between it turns
-    evenly. Where the odometry goes backwards, the body looks the other way. Single wild fixes are bridged.
+    The course is that of the displacement over a second, or over as many as it takes to exceed the noise of the fixes;
+    in between it turns evenly. Where the odometry goes backwards, the body looks the other way. Single wild fixes are
+    bridged.
     """
     stamp_s = compute_seconds(gnss.stamp_ns, zero_ns)
     grid_s = np.arange(stamp_s[0], stamp_s[-1], _GRID_S)
@@ -117,14 +118,15 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
         return stamp_s[:1], np.zeros(1)
     course = np.unwrap(np.angle(way[moving]))
     at_s = at_s[moving]
-    # Even turns in between, so that their integral is the course; before it first moves and after it last did, the robot does not turn.
+    # Even turns in between, so that their integral is the course; before it first moves and after it last did, the
+    # robot does not turn.
     stamp_s = np.repeat(at_s, 2) + np.tile([-1e-6, 1e-6], at_s.size)
     rate = np.repeat(np.diff(course) / np.diff(at_s), 2)
     return stamp_s, np.concatenate(([0.0], rate, [0.0]))
 
 
 def compute_course(velocity_mps: Floats) -> Floats:
-    """Return the direction of horizontal velocities (N, 3) [rad], continuous; that before it where the robot hardly moves."""
+    """Return the direction of horizontal velocities (N, 3) [rad], continuous; the last one at low speed."""
     moving = np.flatnonzero(np.hypot(velocity_mps[:, 0], velocity_mps[:, 1]) > MIN_SPEED_MPS)
     if moving.size == 0:
         return np.zeros(velocity_mps.shape[0])

@@ -1,6 +1,7 @@
-"""Noise of each sensor, estimated from the run itself by pairwise residuals at several time differences (structure functions).
+"""Noise of each sensor, estimated from the run by pairwise residuals at several time differences.
 
-`fit_noise` returns a `NoiseModel`: a `SensorNoise` for each quantity that a sensor measures. Densities are never evidence against a sensor.
+`fit_noise` returns a `NoiseModel`: a `SensorNoise` for each quantity that a sensor measures. Densities are never
+evidence against a sensor.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std, solve_non_nega
 
 @dataclass(frozen=True, slots=True)
 class GaussMarkov:
-    """A stationary process with covariance ``variance * exp(-|dt| / time_s)``; variance in the unit squared of what it errs in.
+    """A stationary process with covariance ``variance * exp(-|dt| / time_s)``; variance in the squared unit.
 
     Without a time white noise, by its density.
 
@@ -39,16 +40,18 @@ class GaussMarkov:
 
 @dataclass(frozen=True, slots=True)
 class SensorNoise:
-    """Errors of one quantity that a sensor measures: white noise, and a Gauss-Markov process, which is to be a state of a filter.
+    """Errors of one measured quantity: white noise, and a Gauss-Markov process, which becomes a state of a filter.
 
     Attributes
     ----------
-    white : of fixes along an axis the variance of each [m²]; of an odometry the variance that its distance gains in a second of driving
-        [m²/s], zero while the robot is stationary; of a yaw rate the variance that its angle gains in a second [rad²/s]. A rate at f Hz has
-        the variance ``white * f``.
-    correlated : of fixes the error of position [m], the process whose structure function is nearest to the fitted sum of processes between
-        1 and 40 s; of an odometry that of its scale around its mean [1]; of a yaw rate that of its bias around its mean [rad/s].
-    claimed_m2 : median variance of the fixes of a run; both parts are those of a fix of this claim, and in proportion to it.
+    white : of fixes along an axis the variance of each [m²]; of an odometry the variance that its distance gains in a
+        second of driving [m²/s], zero while the robot is stationary; of a yaw rate the variance that its angle gains in
+        a second [rad²/s]. A rate at f Hz has the variance ``white * f``.
+    correlated : of fixes the error of position [m], the process whose structure function is nearest to the fitted sum
+        of processes between 1 and 40 s; of an odometry that of its scale around its mean [1]; of a yaw rate that of its
+        bias around its mean [rad/s].
+    claimed_m2 : median variance of the fixes of a run; both parts are those of a fix of this claim, and in proportion
+    to it.
     white_data_share : share of ``white`` that the data determine: 0 is only the prior, 1 only the data.
     """
 
@@ -60,7 +63,7 @@ class SensorNoise:
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Noise of all sensors of a section; ``horizontal`` (east and north alike) and ``vertical`` are of fixes, and None without.
+    """Noise of all sensors of a section; ``horizontal`` (east, north) and ``vertical`` are of fixes, None without.
 
     ``shared_scale`` is the error of the scale of all odometries at once.
     """
@@ -75,13 +78,15 @@ class NoiseModel:
 
 
 PRIORS = {
-    # Share of the claimed variance. RTK: 0.8 cm of 1.5 cm (real logs: 0.5 to 3 cm over 5 to 60 s); code phase: atmosphere and orbits.
+    # Share of the claimed variance. RTK: 0.8 cm of 1.5 cm (real logs: 0.5 to 3 cm over 5 to 60 s); code phase:
+    # atmosphere and orbits.
     "fix, centimetres": GaussMarkov(0.3, 15.0),
     "fix, more": GaussMarkov(0.8, 60.0),
     # m²/s beside the noise that the samples show: 2 mm after a second.
     "wheel_odometry velocity": GaussMarkov(4e-6),
     "visual_odometry velocity": GaussMarkov(4e-6),
-    # [1]: slip by load and ground; cameras vary by 5 to 15 % on slopes. Shared: tilt and slip that no pair of odometries shows.
+    # [1]: slip by load and ground; cameras vary by 5 to 15 % on slopes. Shared: tilt and slip that no pair of
+    # odometries shows.
     "wheel_odometry scale": GaussMarkov(0.01**2, 30.0),
     "visual_odometry scale": GaussMarkov(0.03**2, 30.0),
     "shared scale": GaussMarkov(0.003**2, 30.0),
@@ -106,7 +111,7 @@ PRIORS = {
 """Variances before the fit, and densities of white noise, which have no correlation time; units in the comments."""
 
 _FLOOR_M, _FLOOR_SHARE = 0.002, 0.0025
-"""Of the white noise of fixes, absolute and of the claimed variance: receivers that filter repeat their errors to 0.1 mm."""
+"""Least white noise of fixes, absolute and of the claimed variance: filters repeat their errors to 0.1 mm."""
 _CENTIMETRES_M2 = 0.1**2  # fixes that claim less are RTK's
 _SUMMARY_S = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 40.0])  # where one process stands for a sum
 _SUMMARY_TAU_S = np.geomspace(2.0, 100.0, 40)
@@ -130,9 +135,10 @@ _ROUNDING = 1e-10  # variance of rounding [m²]
 
 
 def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements:
-    """Return measurements whose fixes claim what the run shows, where the receiver claims nothing for most and the recipe too little.
+    """Return measurements whose fixes claim the observed noise, if most have no claim and the recipe's is too small.
 
-    Fixes with an error above a decimetre have no fixed ambiguities: they err as the code phase does, for longer than a run can show.
+    Fixes with an error above a decimetre have no fixed ambiguities: they err as the code phase does, for longer than a
+    run can show.
     """
     if m.gnss is None or m.gnss.unclaimed is None or m.gnss.has_claims:
         return m
@@ -149,7 +155,7 @@ def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> 
 
 
 def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> NoiseModel:
-    """Return the noise of each sensor by the residuals of `find_residuals`: heights first, then the horizontal plane."""
+    """Return the noise of each sensor by the residuals of `find_residuals`: heights first, then the plane."""
     prior = make_prior_model(measurements)
     if not residuals:
         return prior
@@ -177,7 +183,7 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
 
 @dataclass(frozen=True, slots=True)
 class _Cell:
-    """Residuals of one pair, axis and length, of a robot that moves or is stationary; ``features`` (M, C), ``square`` (M,)."""
+    """Residuals of a pair, axis and length, of a moving or stationary robot; ``features`` (M, C), ``square`` (M,)."""
 
     residuals: Residuals
     is_still: bool
@@ -187,7 +193,7 @@ class _Cell:
     """Between the starts of windows that follow each other."""
 
     def find_level(self, variances: Floats, *, truncated: bool) -> tuple[Floats, float]:
-        """Return the features relative to the fitted sum, their mean (C,), and the level of the squares in the same measure."""
+        """Return the features over the fitted sum, their mean (C,), and the level of the squares in the same unit."""
         fitted = multiply_by_vector(self.features, variances) + _ROUNDING
         z2 = self.square / fitted
         relative = (self.features / fitted[:, None]).mean(0)
@@ -241,8 +247,9 @@ class _Fit:
     def _count_windows(self, cells: Sequence[_Cell]) -> Floats:
         """Return how many windows of each cell are independent.
 
-        Windows of length Δ that begin s apart have the correlation (D(Δ + s) + D(|Δ - s|) - 2 D(s)) / 2 D(Δ), with the structure function
-        D of the fitted sum: overlapping windows of white noise are independent of each other, those of a random walk are not.
+        Windows of length Δ that begin s apart have the correlation (D(Δ + s) + D(|Δ - s|) - 2 D(s)) / 2 D(Δ), with the
+        structure function D of the fitted sum: overlapping windows of white noise are independent of each other, those
+        of a random walk are not.
         """
         levels: dict[tuple[tuple[str, str], str, bool], list[tuple[float, float]]] = {}
         for cell in cells:
@@ -291,7 +298,8 @@ class _Fit:
     def find_process(self, prior: GaussMarkov, *names: str) -> GaussMarkov:
         """Return the Gauss-Markov process that is nearest to the sum of those of these names.
 
-        Where the data do not determine it, by their share or by the length of the section, it is the larger of fit and prior.
+        Where the data do not determine it, by their share or by the length of the section, it is the larger of fit and
+        prior.
         """
         taus = {
             row: float(name.rpartition(" ")[2])
@@ -314,7 +322,7 @@ class _Fit:
 
 
 def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
-    """Yield the residuals of the moving and of the stationary robot, without exact zeros, which repeated values give."""
+    """Yield the residuals of the moving and of the stationary robot, without exact zeros of repeated values."""
     features = np.stack([each.features.get(name, np.zeros(each.value.size)) for name in names], -1)
     for is_still in (False, True):
         if is_still:  # what little the robot moves then must not explain them
@@ -345,9 +353,10 @@ def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
 def _find_fix_prior(
     name: str, horizontal: SensorNoise, vertical: SensorNoise, of_heights: Mapping[str, float]
 ) -> tuple[float, float]:
-    """Return the same for fixes; in the plane it is that of the heights, as far as the data determine it, by the ratio of claims.
+    """Return the noise of fixes in the plane from that of heights by the ratio of claims, as far as data show it.
 
-    Heights are compared with a track whose pitch hardly errs, while an odometry's scale hides slow errors of fixes in the plane.
+    Heights are compared with a track whose pitch hardly errs, while an odometry's scale hides slow errors of fixes in
+    the plane.
     """
     axis, kind, time_s = (*name.split(), "0")[:3]
     fixes = vertical if axis == "up" else horizontal
@@ -370,7 +379,7 @@ def _find_fix_prior(
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:
-    """Return the variance of the heading [rad²] that is left between the knots of the alignment: of a Brownian bridge."""
+    """Return the variance of the heading [rad²] between the knots of the alignment: of a Brownian bridge."""
     best = next(iter(prior.turns.values()))
     return KNOT_S / 6.0 * best.white + KNOT_S**2 / 100.0 * best.correlated.variance
 

@@ -1,9 +1,11 @@
 """The default estimator: an error-state unscented filter on SE(3), and its smoother (`filter_kernel`: equations).
 
-Where sensors contradict each other for long, changes are searched that explain it (`changes`), and the section is estimated again.
+Where sensors contradict each other for long, changes are searched that explain it (`changes`), and the section is
+estimated again.
 
-Memory is bounded: the forward pass keeps a checkpoint for each block of ticks; on the way back each block is filtered once more, this
-time with everything kept. The second filter repeats the arithmetic of the first exactly, gates included.
+Memory is bounded: the forward pass keeps a checkpoint for each block of ticks; on the way back each block is filtered
+once more, this time with everything kept. The second filter repeats the arithmetic of the first exactly, gates
+included.
 """
 
 from __future__ import annotations
@@ -62,7 +64,7 @@ _UNCHANGED = Hypothesis(())
 _BLOCK = 1024
 """Ticks between checkpoints."""
 _MIN_EVENT_GAIN = 20.0
-"""Log evidence [nat] by which an event must explain more, beyond its cost: the best of a section's ticks reaches 12 by chance."""
+"""Least log evidence of an event beyond its cost [nat]: the best of a section's ticks reaches 12 by chance."""
 
 
 def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_probability: float = 0.999) -> Trajectory:  # fmt: skip
@@ -104,7 +106,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
 
 
 def _can_tell_changes(m: Measurements) -> bool:
-    """Return whether a second sensor of motion shows what changed, and fixes show it no worse than the others carry the pose for a minute.
+    """Return whether another sensor shows the change, and fixes are no worse than a minute without them.
 
     An IMU and an odometry carry it, or a camera that sees all turns.
     """
@@ -131,7 +133,8 @@ def prepare_section(m: Measurements, output_ns: Ints, gate_probability: float) -
 class SectionModel:
     """A section as estimators take it, under one hypothesis or another.
 
-    ``residuals`` are of the pairs of sensors, ``std`` is the standard deviation of every error before the measurements, shape (45,).
+    ``residuals`` are of the pairs of sensors, ``std`` is the standard deviation of every error before the measurements,
+    shape (45,).
     """
 
     measurements: Measurements
@@ -158,8 +161,8 @@ class SectionModel:
     ) -> Pass:
         """Return the forward pass under a hypothesis from a start of all errors.
 
-        One that ``judges`` holds all errors that an event could change, and follows no fix that is rejected. With ``kept`` measurements,
-        (K, 9, 3), the pass uses those, without a gate.
+        One that ``judges`` holds all errors that an event could change, and follows no fix that is rejected. With
+        ``kept`` measurements, (K, 9, 3), the pass uses those, without a gate.
         """
         ticks, model, begin = self.prepare(start, hypothesis, judges=judges)
         if kept is not None:
@@ -193,7 +196,7 @@ class SectionModel:
         return ticks, model, widen_start(start, std).select(model.active)
 
     def correct_arm(self, made: Pass, smoothed: Smoothed) -> SectionModel:
-        """Return the section with an antenna at an unknown place, if it surely shows it elsewhere than where it is stated; else itself."""
+        """Return the section with an antenna of unknown place if it surely shows another than stated; else itself."""
         gnss, active = self.measurements.gnss, list(made.model.active)
         if gnss is None or Error.ARM not in active:
             return self
@@ -208,7 +211,8 @@ class SectionModel:
     def explain(self, made: Pass, events: Sequence[Change], start: Memory) -> Hypothesis:
         """Return the changes that explain most of where sensors contradict each other, none where they do not.
 
-        ``events`` explain much of the pass ``made``. Smooth errors of fixes, which the filter follows, need no contradiction.
+        ``events`` explain much of the pass ``made``. Smooth errors of fixes, which the filter follows, need no
+        contradiction.
         """
         period_s, most = self.ticks.inputs.period_s, read_threshold("changes-unlikely", "max_change_count")
         excursions = find_excursions(self.residuals, self.noise, self.ticks)
@@ -249,7 +253,7 @@ class SectionModel:
         return best
 
     def _add_events(self, given: Hypothesis, tests: Tests, start: Memory) -> tuple[Hypothesis, Tests]:
-        """Return a hypothesis with the events that explain most beyond it, found one after the other; ``tests`` are of its pass."""
+        """Return a hypothesis with the events that explain most beyond it, one by one; ``tests`` are of its pass."""
         best, events = (given, tests), list[Change]()
         for _ in range(6):  # two of them may be one change
             kept = drop_outliers(self.ticks, best[1])
@@ -294,7 +298,7 @@ def filter_section(ticks: Ticks, model: FilterModel, start: Memory, *, until: in
 
 
 def smooth_section(made: Pass, *, with_displacements: bool = True) -> tuple[Smoothed, tuple[Change, ...]]:
-    """Return the smoothed estimate of a forward pass, and events that explain much more of it than they cost, the most likely first."""
+    """Return the smoothed estimate of a forward pass, and events worth more than their cost, the most likely first."""
     size, n = made.states.shape[0], made.model.active.size
     lags = np.array([round(lag_s / made.ticks.inputs.period_s) for lag_s in DISPLACEMENT_LAGS_S])
     adjoint = make_adjoint(n, int(lags.max()) if with_displacements else 0)
@@ -345,7 +349,7 @@ def _list_candidates(made: Pass) -> tuple[list[tuple[str, int]], Candidates]:
 def make_trajectory(
     section: SectionModel, made: Pass, smoothed: Smoothed, output_ns: Ints, explained: Hypothesis
 ) -> Trajectory:
-    """Return the trajectory at the wanted stamps [ns]; its standard deviations include errors that no state of the filter has."""
+    """Return the trajectory at the wanted stamps [ns]; its standard deviations include errors outside the filter."""
     m, noise, std, ticks = section.measurements, section.noise, section.std, made.ticks
     at = np.searchsorted(ticks.stamp_ns, output_ns)
     x, variances = smoothed.states[at], smoothed.variances[at]
@@ -395,7 +399,7 @@ def make_trajectory(
 
 
 def _make_motion(x: Floats, ticks: Ticks, at: Ints) -> tuple[Floats, Floats, Floats]:
-    """Return attitude of the robot, shape (N, 3, 3), velocity in ENU [m/s] and angular velocity in its axes [rad/s], shapes (N, 3)."""
+    """Return attitude (N, 3, 3), velocity in ENU [m/s] and angular velocity in robot axes [rad/s], shapes (N, 3)."""
     imu = x[:, :9].reshape(-1, 3, 3)
     mount = x[:, Error.MOUNT + 6 : Error.MOUNT + 9]
     rotation = imu + np.cross(imu, mount[:, None])  # a small turn
@@ -408,7 +412,7 @@ def _make_motion(x: Floats, ticks: Ticks, at: Ints) -> tuple[Floats, Floats, Flo
 
 
 def _interpolate_links(smoothed: Smoothed, at: Ints, output_ns: Ints) -> Floats:
-    """Return the variance of displacements at each wanted stamp [m²], shape (N, 6); NaN where none stands at the other end."""
+    """Return the variance of displacements at each wanted stamp [m²], shape (N, 6); NaN without another end."""
     found = np.full((output_ns.size, len(DISPLACEMENT_LAGS_S)), np.nan)
     for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):
         known = np.flatnonzero(np.isfinite(smoothed.links[:, column]))

@@ -1,8 +1,8 @@
 """Forward pass of the error-state unscented filter over ticks of the track; the smoother: `smoother_kernel`.
 
-Means pass through motion and measurements at the centre. Covariances pass through sigma points of the errors on which each depends, drawn
-anew from their marginal covariance: with ``P_s = L L'``, the points ``x ± √3 L_i`` give the linear map ``F`` that fits
-the function best and, as additional noise, what that map misses::
+Means pass through motion and measurements at the centre. Covariances pass through sigma points of the errors on which
+each depends, drawn anew from their marginal covariance: with ``P_s = L L'``, the points ``x ± √3 L_i`` give the linear
+map ``F`` that fits the function best and, as additional noise, what that map misses::
 
     F L_i = (f(x + √3 L_i) - f(x - √3 L_i)) / 2√3        missed: Σ e_i e_i' / 3,  e_i = (f(x + √3 L_i) + f(x - √3 L_i)) / 2 - f(x)
 
@@ -56,11 +56,14 @@ class TickInputs(NamedTuple):
     mode, turned, gained : motion from the tick before, as `move_state` takes it, (K,), (K, 9), (K, 6).
     noise : variance added to rotation and body velocity [rad², m²/s²], (K, 6).
     rate, has_gyro : angular velocity at the tick, as measured [rad/s], (K, 3), and whether by a gyroscope, (K,).
-    acceleration : of the body, forward, at the tick [m/s²], (K,). Not the state's own, whose noise would look like a lag of every sensor.
-    value, variance : measurements by kind, (K, 9, 3); NaN: none. Of the attitude of a pose zero: it is measured from ``attitude``.
+    acceleration : of the body, forward, at the tick [m/s²], (K,). Not the state's own, whose noise would look like a
+    lag of every sensor.
+    value, variance : measurements by kind, (K, 9, 3); NaN: none. Of the attitude of a pose zero: it is measured from
+    ``attitude``.
     tau : time of the measurement after the tick [s], (K, 9).
     levers : places of odometries on the robot [m], (9, 3).
-    fix_kept, fix_noise : share of the fixes' correlated error that stays since the tick before (K,), and variance added to it [m²], (K, 3).
+    fix_kept, fix_noise : share of the fixes' correlated error that stays since the tick before (K,), and variance added
+    to it [m²], (K, 3).
     attitude : rotation vector of a pose's attitude, enu_from_robot [rad], (K, 3).
     """
 
@@ -87,12 +90,12 @@ class FilterModel(NamedTuple):
     Attributes
     ----------
     active : errors that are not known exactly, in order, (n,).
-    depends : by kind of measurement, and then motion by odometry and by gyroscope, the places in ``active`` of the errors on which it
-        depends, (11, n), of which the first ``counts`` (11,) are used.
+    depends : by kind of measurement, and then motion by odometry and by gyroscope, the places in ``active`` of the
+        errors on which it depends, (11, n), of which the first ``counts`` (11,) are used.
     kept, noise : share that stays of each error over a tick, and variance added, (n,).
     gates : largest squared normalised innovation by kind; infinite: no gate.
-    patience : by kind, rejections in a row, and seconds since the last accepted measurement, after which one is accepted; the seconds
-        where no other sensor of motion is heard; (9, 3).
+    patience : by kind, rejections in a row, and seconds since the last accepted measurement, after which one is
+        accepted; the seconds where no other sensor of motion is heard; (9, 3).
     mount : place of the IMU's mounting in ``active``; -1: known exactly.
     scales : by kind, the place in ``active`` of the sensor's own scale; -1: none.
     events : changes of errors: (tick, place in ``active``, whether the error is another one now); (e, 3).
@@ -114,7 +117,7 @@ class FilterModel(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """State carried from tick to tick: x (51,), P (n, n), rejections in a row and seconds since the last accepted, by kind, (9, 2)."""
+    """State between ticks: x (51,), P (n, n), rejections in a row and seconds since acceptance by kind, (9, 2)."""
 
     x: Vector
     P: Matrix
@@ -130,7 +133,7 @@ class Memory(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """What the smoother needs of B ticks: motion F, kept shares, updates by kind (gain K, H, S⁻¹ y, S⁻¹, turn of axes), P after all."""
+    """Inputs of the smoother for B ticks: motion F, kept shares, updates by kind (K, H, S⁻¹ y, S⁻¹, turn), last P."""
 
     F: NDArray[np.float64]
     kept: Matrix
@@ -260,7 +263,7 @@ def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, 
 
 @compile_kernel
 def _decay(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, kept: Vector) -> None:
-    """Let parameters decay and wander over tick k; begin its events. ``kept`` becomes the share that stays of each error."""
+    """Apply decay, walk and events of parameters to tick k; ``kept`` becomes the remaining share of each error."""
     n = P.shape[0]
     for i in range(n):
         is_fix_error = Error.FIX_ERROR <= model.active[i] < Error.FIX_ERROR + 3
@@ -437,7 +440,7 @@ def _correct(x: Vector, P: Matrix, active: Indices, size: int, gain: Any, K: Mat
 
 @compile_kernel
 def _widen(kind: int, P: Matrix, y: Vector, size: int, scale: int) -> None:
-    """Widen P where a sensor was rejected for long, so that it is heard again: the state has jumped, or the ``scale`` there (-1: none)."""
+    """Widen P after a long rejection of a sensor, so that it counts again: the state, or the ``scale`` (-1: none)."""
     if kind == Kind.FIX:
         P[Error.THETA + 2, Error.THETA + 2] += 0.1**2
         for i in range(3):

@@ -1,14 +1,17 @@
 """Where a section starts: position, attitude and gyroscope bias, found offline from all that follows.
 
-Yaw comes from the course over ground: the path that the odometry and the gyroscope draw from an arbitrary yaw is laid over the GNSS fixes
-by the rotation that fits best (the planar case of Wahba's problem: the angle of the sum of products of complex numbers). At least
-5 m at 0.2 m/s or more are asked for, ten standard deviations of the fixes where that is longer. Since the odometry's velocity has a
-sign, a run may start in reverse; since the path is drawn, it may start with a turn. Roll and pitch come from the specific force.
+Yaw comes from the course over ground: the path that the odometry and the gyroscope draw from an arbitrary yaw is laid
+over the GNSS fixes by the rotation that fits best (the planar case of Wahba's problem: the angle of the sum of products
+of complex numbers). At least 5 m at 0.2 m/s or more are asked for, ten standard deviations of the fixes where that is
+longer. Since the odometry's velocity has a sign, a run may start in reverse; since the path is drawn, it may start with
+a turn. Roll and pitch come from the specific force.
 
-The robot is stationary where the wheels do not turn and the gyroscope is quiet; wheels at rest on a robot that slides, or a gyroscope at
-rest on a straight, are not enough. It gives two more measurements (zero velocity, and the gyroscope's bias) and the initial bias.
+The robot is stationary where the wheels do not turn and the gyroscope is quiet; wheels at rest on a robot that slides,
+or a gyroscope at rest on a straight, are not enough. It gives two more measurements (zero velocity, and the gyroscope's
+bias) and the initial bias.
 
-Source: B. K. P. Horn, "Closed-form solution of absolute orientation using unit quaternions", JOSA A 4 (4), 1987 (section 2.B, planar).
+Source: B. K. P. Horn, "Closed-form solution of absolute orientation using unit quaternions", JOSA A 4 (4), 1987
+(section 2.B, planar).
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind 
 
 
 def find_initial_state(measurements: Measurements, stationary_ns: Ints, start_ns: int) -> InitialState:
-    """Return the state at ``start_ns`` [ns], the first stamp of a section; ``stationary_ns`` [ns], shape (K, 2), are its stops."""
+    """Return the state at ``start_ns`` [ns], the first stamp of a section; ``stationary_ns`` [ns], (K, 2): stops."""
     bias, bias_std = _estimate_gyro_bias(measurements.imu, stationary_ns)
     roll, pitch, tilt_std = _estimate_tilt(measurements.imu, stationary_ns, start_ns)
     path = _Path(measurements, start_ns, bias)
@@ -79,7 +82,7 @@ def _estimate_tilt(imu: InertialMeasurements | None, stationary_ns: Ints, start_
 
 
 class _Path:
-    """The path by `DeadReckoning`; without odometry the robot drives forward as fast as the fixes do, with an antenna alone anywhere."""
+    """The path by `DeadReckoning`; without odometry the robot drives forward at the speed of the fixes."""
 
     def __init__(self, m: Measurements, start_ns: int, bias: Floats) -> None:
         self.start_ns, self.is_shown, self._has_odometry = start_ns, not m.is_antenna_alone, bool(m.odometries())
@@ -134,7 +137,7 @@ def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_s
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Yaw at the start by a window of fixes, its σ, the RMS distance of the fixes from the path, and the middle of the window."""
+    """Yaw at the start by a window of fixes, its σ, the fixes' RMS distance from the path, the window's middle."""
 
     yaw_rad: float
     yaw_std_rad: float
@@ -165,7 +168,7 @@ def _fit_course(gnss: Positions, path: _Path) -> _Fit | None:
 
 
 def _fit(fixes: Plane, drawn: Plane, stamp_s: Floats, noise_m: float) -> _Fit | None:
-    """Return the rotation (and scale) that fits the drawn path to the fixes best; None if the odometry stands while the fixes move."""
+    """Return the rotation (and scale) that fits the drawn path to the fixes; None if only the fixes move."""
     a, b = fixes - fixes.mean(), drawn - drawn.mean()
     extent2 = float(np.sum(np.abs(b) ** 2))
     if extent2 < 1.0 or np.sqrt(extent2) < 0.2 * np.sqrt(np.sum(np.abs(a) ** 2)):
@@ -177,7 +180,7 @@ def _fit(fixes: Plane, drawn: Plane, stamp_s: Floats, noise_m: float) -> _Fit | 
 
 
 def _estimate_position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> tuple[Floats, Floats]:
-    """Return base_link at the start and its standard deviation: the median of the first fixes less the displacement since the start."""
+    """Return base_link at the start and its σ: the median of the first fixes less the displacement since the start."""
     if gnss is None:
         return np.zeros(3), np.full(3, 1e-3)
     few = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 1_000_000_000, "right"), 3, 10)))
@@ -198,7 +201,7 @@ _WINDOW_NS = 500_000_000  # window of means and scatter
 
 
 def find_stationary_intervals(measurements: Measurements) -> Ints:
-    """Return when the robot is stationary for certain: first and last stamp of each stay of at least 0.3 s [ns], shape (K, 2), in order.
+    """Return certain stops: first and last stamp of each stop of at least 0.3 s [ns], shape (K, 2), sorted.
 
     Empty without wheels or without gyroscope.
     """
@@ -222,7 +225,7 @@ def _is_steady(at_ns: Ints, stamp_ns: Ints, values: Floats, largest: float, spre
 
 
 def _find_intervals(stamp_ns: Ints, still: NDArray[np.bool_]) -> Ints:
-    """Return the runs of True, shape (K, 2), without those that are short; gaps of half a second end them, both ends are cut."""
+    """Return the runs of True, shape (K, 2), without short ones; gaps of half a second end them, and ends are cut."""
     joined = still[1:] & still[:-1] & (np.diff(stamp_ns) < _WINDOW_NS)
     first = np.flatnonzero(still & ~np.concatenate(([False], joined)))
     last = np.flatnonzero(still & ~np.concatenate((joined, [False])))

@@ -1,9 +1,10 @@
 """How the body moved by one odometry and the turn rates, in a level frame, aligned robustly with the fixes.
 
-Attitude is dead reckoning: the gyroscope's increments multiplied, in a frame that drifts. Up in that frame is the specific force averaged
-over seconds, less the accelerations of the odometry; heading is the direction of the body's x-axis about it, and wanders with the
-gyroscope. The alignment takes out what a filter estimates anyhow: the odometry's scale, the heading's slow drift, an error of the
-antenna's lever arm and a time offset, by iterated least squares with weights that fall with the square of a residual (Cauchy's loss).
+Attitude is dead reckoning: the gyroscope's increments multiplied, in a frame that drifts. Up in that frame is the
+specific force averaged over seconds, less the accelerations of the odometry; heading is the direction of the body's
+x-axis about it, and wanders with the gyroscope. The alignment takes out what a filter estimates anyhow: the odometry's
+scale, the heading's slow drift, an error of the antenna's lever arm and a time offset, by iterated least squares with
+weights that fall with the square of a residual (Cauchy's loss).
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ _ROUNDS, _FEWEST = 8, 4
 class Attitude:
     """Attitude on a grid of times [s], in a level frame whose heading drifts.
 
-    ``rotation`` (n, 3, 3) level_from_base_link; ``yaw_rad`` (n,) continuous; ``rate_radps`` (n, 3) in base_link; ``role``: the source of
-    the yaw rate; ``is_level``: roll and pitch are measured.
+    ``rotation`` (n, 3, 3) level_from_base_link; ``yaw_rad`` (n,) continuous; ``rate_radps`` (n, 3) in base_link;
+    ``role``: the source of the yaw rate; ``is_level``: roll and pitch are measured.
     """
 
     time_s: Floats
@@ -55,7 +56,7 @@ class Attitude:
 
 
 def get_turn_rates(measurements: Measurements, role: str) -> tuple[Ints, Floats]:
-    """Return stamps [ns] and angular velocities (N, 3) of a sensor; about x and y zero where it does not measure them."""
+    """Return stamps [ns] and angular velocities (N, 3) of a sensor; zero about x and y if not measured."""
     if role == IMU and measurements.imu is not None:
         return measurements.imu.stamp_ns, measurements.imu.angular_velocity_radps
     source = measurements.odometries()[role]
@@ -185,7 +186,8 @@ def align_tracks(
 ) -> dict[str, OdometryTrack]:
     """Return the tracks of odometries in the frame of the fixes; none where the fixes show no motion.
 
-    Heading, arm and time offset of the odometry that follows the fixes best also hold for the others; each has its own scale.
+    Heading, arm and time offset of the odometry that follows the fixes best also hold for the others; each has its own
+    scale.
     """
     alignment = _Alignment(gnss, attitude, zero_ns)
     fits = {role: fit for role, forward in forward_mps.items() if (fit := alignment.fit(forward)) is not None}
@@ -201,7 +203,7 @@ def align_tracks(
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Transformation of a dead-reckoned track to the fixes: ``turn_rad`` (n,) on the grid; ``noise_m``: median residual."""
+    """Transformation of a dead-reckoned track to fixes: ``turn_rad`` (n,) on the grid; ``noise_m``: median residual."""
 
     turn_rad: Floats
     scale: float = 1.0

@@ -1,13 +1,14 @@
-"""Measurements as the estimators take them: plain arrays in base_link axes and in the ENU plane of the datum, every number usable.
+"""Measurements for the estimators: arrays in base_link axes and in the datum's ENU plane, every number usable.
 
-What the stage has already done when one of these exists: units and frames converted, mounting rotations applied (lever arms are kept
-beside the values, since they act through the attitude), unusable rows taken out and counted, unknown or absurd variances replaced
-and floored. Rows are sorted by stamp, without repetitions.
+What the stage has already done when one of these exists: units and frames converted, mounting rotations applied (lever
+arms are kept beside the values, since they act through the attitude), unusable rows taken out and counted, unknown or
+absurd variances replaced and floored. Rows are sorted by stamp, without repetitions.
 
-A run is cut into sections, which are fused one by one. A clock epoch is a section of its own: nothing is integrated across a step of the
-clock. So is what follows a pause of all sensors of more than 5 s: the estimator does not carry its certainty over it. Both estimators take
-the `Measurements` of a section, its `InitialState` and the wanted stamps, increasing, inside the span of the measurements, and return a
-`Trajectory`: state of base_link, its uncertainty, rejected measurements.
+A run is cut into sections, which are fused one by one. A clock epoch is a section of its own: nothing is integrated
+across a step of the clock. So is what follows a pause of all sensors of more than 5 s: the estimator does not carry its
+certainty over it. Both estimators take the `Measurements` of a section, its `InitialState` and the wanted stamps,
+increasing, inside the span of the measurements, and return a `Trajectory`: state of base_link, its uncertainty,
+rejected measurements.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ FIXES = (GNSS, POSE)
 """Roles of positions: a pose is fused as fixes with an attitude."""
 
 NO_TRUST = 1e6
-"""Larger variances, of a kilometre or a kilometre a second, are cut to this: as little trust, and differences keep their digits."""
+"""Largest variances, of a kilometre or a kilometre a second; larger ones would cost digits of differences."""
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
 STATED_ARM_STD_M = (0.05, 0.05, 0.1)
 """Of an antenna whose place is stated: a tape measure, and the height of base_link over the ground."""
@@ -44,18 +45,21 @@ UNMEASURED_RAD2 = 1e2
 
 @dataclass(frozen=True, slots=True)
 class Positions:
-    """GNSS: positions of an antenna. Or a pose that another program estimated: positions of a sensor, and the robot's attitude.
+    """GNSS: positions of an antenna. Or another program's pose: positions of a sensor, and the robot's attitude.
 
     Attributes
     ----------
     stamp_ns : [ns], shape (N,), int64, increasing.
     position_enu_m : [m], shape (N, 3), antenna in the ENU plane of the datum.
     variance_m2 : [m²], shape (N, 3), east, north, up; floored, never unknown.
-    lever_arm_m, lever_arm_std_m : [m], position of the antenna in base_link, and its standard deviation; 0: known exactly.
-    unclaimed : shape (N,), where the receiver claims none and the variance is the recipe's; None where it always claims one.
-    quat_xyzw, rotation_variance_rad2 : attitude enu_from_base_link, shape (N, 4), NaN where absent, and variance about the robot's axes,
-        shape (N, 3); None: no attitude is measured.
-    mounting_xyzw, mounting_std_rad : base_link_from_sensor of a pose, stated or as the motion shows it, and σ about each axis.
+    lever_arm_m, lever_arm_std_m : [m], position of the antenna in base_link, and its standard deviation; 0: known
+    exactly.
+    unclaimed : shape (N,), where the receiver claims none and the variance is the recipe's; None where it always claims
+    one.
+    quat_xyzw, rotation_variance_rad2 : attitude enu_from_base_link, shape (N, 4), NaN where absent, and variance about
+        the robot's axes, shape (N, 3); None: no attitude is measured.
+    mounting_xyzw, mounting_std_rad : base_link_from_sensor of a pose, stated or as the motion shows it, and σ about
+    each axis.
     lag_std_s : [s], standard deviation of the delay of its stamps: drivers stamp on arrival.
     """
 
@@ -105,12 +109,13 @@ class BodyVelocities:
     Attributes
     ----------
     stamp_ns : [ns], shape (N,), int64, increasing. Middle of the interval where a velocity comes from two poses.
-    velocity_mps : [m/s], shape (N, 3), velocity of the point at ``lever_arm_m``. Wheels: only x is measured, y and z are NaN.
+    velocity_mps : [m/s], shape (N, 3), velocity of the point at ``lever_arm_m``. Wheels: only x is measured, y and z
+    are NaN.
     variance_m2ps2 : [m²/s²], shape (N, 3); NaN exactly where the velocity is.
     yaw_rate_radps : [rad/s], shape (N,), about base_link's z; NaN where the source gives none.
     lever_arm_m : [m], the measured point in base_link.
-    turn_rate_radps : [rad/s], shape (N, 3), about all three axes of base_link, z as in ``yaw_rate_radps``; None where the source is flat
-        (wheels) or gives none.
+    turn_rate_radps : [rad/s], shape (N, 3), about all three axes of base_link, z as in ``yaw_rate_radps``; None where
+        the source is flat (wheels) or gives none.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -136,10 +141,13 @@ class InertialMeasurements:
     stamp_ns : [ns], shape (N,), int64, increasing.
     angular_velocity_radps : [rad/s], shape (N, 3), base_link axes.
     specific_force_mps2 : [m/s²], shape (N, 3), base_link axes; +g along the upward axis at rest.
-    quat_xyzw : shape (N, 4), enu_from_base_link by the unit's own attitude filter; NaN where absent. Yaw may be magnetic or offset.
+    quat_xyzw : shape (N, 4), enu_from_base_link by the unit's own attitude filter; NaN where absent. Yaw may be
+    magnetic or offset.
     gyro_std_radps, accelerometer_std_mps2 : white noise at the unit's rate, one axis.
-    accelerometer_usable : False where the specific force is not one (gravity removed, other units): the gyroscope alone is used.
-    accelerometer_noise_mps2 : the same around each sample, shape (N,): vibration comes and goes with the motion; None: the same throughout.
+    accelerometer_usable : False where the specific force is not one (gravity removed, other units): the gyroscope alone
+    is used.
+    accelerometer_noise_mps2 : the same around each sample, shape (N,): vibration comes and goes with the motion; None:
+    the same throughout.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -159,8 +167,8 @@ Sensor = Positions | GroundVelocities | InertialMeasurements | BodyVelocities
 class Measurements:
     """All measurements of one section of one clock epoch without a long gap; a role without measurements is None.
 
-    At least one of ``gnss``, ``wheels`` and ``visual`` is there. ``nonholonomic_std_mps``: sideways and vertical body velocity are
-    zero to within this. ``doppler`` goes with ``gnss``, whose antenna it is of.
+    At least one of ``gnss``, ``wheels`` and ``visual`` is there. ``nonholonomic_std_mps``: sideways and vertical body
+    velocity are zero to within this. ``doppler`` goes with ``gnss``, whose antenna it is of.
     """
 
     gnss: Positions | None = None
@@ -300,9 +308,10 @@ class Trajectory:
     yaw_std_rad : [rad], shape (N,).
     forward_velocity_std_mps : [m/s], shape (N,), of the velocity along base_link's x axis.
     rejections : what the gate refused.
-    displacement_std_m : [m], shape (N, 6), of the horizontal displacement from each row to the one `DISPLACEMENT_LAGS_S` later, along
-        its direction, the correlation of both ends counted exactly; NaN where no row stands there, and throughout in a forward filter,
-        which does not know it. In between the variance may be interpolated in time, from zero at no time.
+    displacement_std_m : [m], shape (N, 6), of the horizontal displacement from each row to the one
+        `DISPLACEMENT_LAGS_S` later, along its direction, the correlation of both ends counted exactly; NaN where no row
+        stands there, and throughout in a forward filter, which does not know it. In between the variance may be
+        interpolated in time, from zero at no time.
     facts : what the filter counted and settled on.
     """
 
@@ -334,7 +343,7 @@ class TrackSection:
 
 
 def cut_sections(measurements: Mapping[int, Measurements], cuts_ns: Sequence[int] = ()) -> list[TrackSection]:
-    """Return the sections of measurements given by clock epoch, in order of epoch and time; those without motion are left out.
+    """Return the sections of measurements by clock epoch, in order of epoch and time, without those without motion.
 
     A section ends at a pause, and before each of the stamps ``cuts_ns`` of a measurement.
     """
@@ -358,8 +367,8 @@ def cut_sections(measurements: Mapping[int, Measurements], cuts_ns: Sequence[int
 def make_track_stamps(section: TrackSection, *, period_ns: int, max_gap_ns: int) -> NDArray[np.int64]:
     """Return the multiples of the period inside a section [ns], without those in a gap.
 
-    A gap is a time without any of GNSS, wheels and visual odometry longer than ``max_gap_ns`` and than 2.5 times their usual spacing:
-    the IMU alone does not determine a track. A gap is a step in the stamps.
+    A gap is a time without any of GNSS, wheels and visual odometry longer than ``max_gap_ns`` and than 2.5 times their
+    usual spacing: the IMU alone does not determine a track. A gap is a step in the stamps.
     """
     first = -(-section.start_ns // period_ns) * period_ns
     stamp = np.arange(first, section.end_ns + 1, period_ns, dtype=np.int64)

@@ -1,12 +1,14 @@
 """Residuals of every pair of sensors over windows of several lengths, and what each density adds to their variance.
 
-A residual is the motion by one sensor less that by another, over a window of Δ seconds: of fixes against an odometry along and across the
-heading in the window's middle, and up; of two odometries along. Its variance is a sum of densities times features, which are integrals
-over the path driven in the window:
+A residual is the motion by one sensor less that by another, over a window of Δ seconds: of fixes against an odometry
+along and across the heading in the window's middle, and up; of two odometries along. Its variance is a sum of densities
+times features, which are integrals over the path driven in the window:
 
 - fixes: white noise and Gauss-Markov processes, on each axis, also at rest;
-- an odometry: white velocity noise, and a scale as Gauss-Markov processes; a scale that all odometries share, which no pair of them shows;
-- slide: white noise of the sideways velocity; heading and pitch: Gauss-Markov errors of the direction in which an odometry is added up.
+- an odometry: white velocity noise, and a scale as Gauss-Markov processes; a scale that all odometries share, which no
+pair of them shows;
+- slide: white noise of the sideways velocity; heading and pitch: Gauss-Markov errors of the direction in which an
+odometry is added up.
 """
 
 from __future__ import annotations
@@ -66,7 +68,7 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """A section's measurements and attitude; rows of the attitude's grid where windows without fixes may end, and their stamps [ns]."""
+    """A section's measurements and attitude; rows where windows without fixes may end, and their stamps [ns]."""
 
     measurements: Measurements
     attitude: Attitude
@@ -206,7 +208,7 @@ def _take_nodes(values: Floats, start_s: Floats, end_s: Floats) -> Floats:
 
 
 def _integrate_process(weight: Floats, window_s: float, tau_s: float) -> Floats:
-    """Return the variance of the integral of weights (M, nodes) times a Gauss-Markov process of variance 1, shape (M,)."""
+    """Return the variance of the integral of weights (M, nodes) times a unit Gauss-Markov process, shape (M,)."""
     step_s = window_s / weight.shape[1]
     node = np.arange(weight.shape[1])
     covariance = np.exp(-np.abs(node[:, None] - node) * (step_s / tau_s)) * step_s**2
@@ -251,7 +253,7 @@ class _Window:
         return features
 
     def describe_moving(self, name: str) -> dict[str, Floats]:
-        """Return the factors of errors of fixes that are there only while the robot moves: receivers hold a stationary position."""
+        """Return the factors of errors of fixes that exist only in motion: receivers hold a stationary position."""
         begin, end = (np.abs(self._speed[:, [0, -1]]) > _STILL_MPS).T.astype(np.float64)
         return {
             f"{name} moving {tau:g}": begin + end - 2.0 * begin * end * np.exp(-self.time_s / tau) for tau in MOVING_S

@@ -1,7 +1,7 @@
 """Parameters of the estimator: what is known of each beforehand, and how it wanders.
 
-Each is an entry of the state. What the measurements do not show of a parameter keeps its prior by the update itself, and its uncertainty
-is part of that of the track. Noise of the sensors: `tcpipe.fusion.densities`.
+Each is an entry of the state. What the measurements do not show of a parameter keeps its prior by the update itself,
+and its uncertainty is part of that of the track. Noise of the sensors: `tcpipe.fusion.densities`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tcpipe.geometry.rotation import matrix_from_quat
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter: its first entry in the errors and their number, standard deviation beforehand, and that of a second's walk.
+    """A parameter: its first entry in the errors, their number, prior standard deviation, and that of a second's walk.
 
     A deviation of 0 is another for each run, as the source says.
     """
@@ -70,7 +70,7 @@ _MINUTE_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Change of the error at ``place`` at a tick by ``mean`` with a deviation ``std``, or, if ``is_new``, to another of the same prior."""
+    """Change of the error at ``place`` at a tick by ``mean`` ± ``std``, or, if ``is_new``, a new draw of its prior."""
 
     tick: int
     place: int
@@ -80,7 +80,7 @@ class Event:
 
 
 def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Floats, Floats, Floats]:
-    """Return standard deviation, walk and correlation time of every error, shapes (45,): 0 where it is exact, or nothing depends on it."""
+    """Return standard deviation, walk and correlation time of all errors, (45,): 0 if exact or without effect."""
     std, walk = np.zeros(state.N), np.zeros(state.N)
     has_imu = m.imu is not None
     inertial = bool((ticks.inputs.mode == Mode.INERTIAL).any())
@@ -130,8 +130,8 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
 def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> Floats:
     """Return the standard deviation of what fixes err throughout the section [m], shape (3,).
 
-    That is what fixes claim beyond the errors that the section shows; without tilt also the antenna's place, since an antenna that sways
-    looks like one elsewhere, and without heights, which show slopes, the sway.
+    That is what fixes claim beyond the errors that the section shows; without tilt also the antenna's place, since an
+    antenna that sways looks like one elsewhere, and without heights, which show slopes, the sway.
     """
     axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
     variance = np.array([max(0.0, fix.claimed_m2 - fix.white - fix.correlated.variance) for fix in axes])
@@ -191,7 +191,8 @@ def make_model(
 ) -> FilterModel:
     """Return the filter's model.
 
-    ``possible``: errors that other events could change; where these are judged, rejected fixes are never taken to be right after all.
+    ``possible``: errors that other events could change; where these are judged, rejected fixes are never taken to be
+    right after all.
     """
     kept = np.ones(state.N) if time_s is None else np.exp(-period_s / time_s)
     involved = {event.place for event in events} | set(possible)

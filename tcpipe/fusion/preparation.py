@@ -1,9 +1,9 @@
 """From a stream's columns to measurements: base_link axes, the datum's plane, usable variances, one row a stamp.
 
-Rows without a measurement (no velocity and no pose to make one from, a fix at 0, 0, a sample beyond any sensor's range) are excluded and
-returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is replaced by the recipe's, or by the median
-of the stated ones where that is larger; one that is too small is raised to a floor: a zero covariance is not trust. Coordinates with few
-decimals err by rounding besides.
+Rows without a measurement (no velocity and no pose to make one from, a fix at 0, 0, a sample beyond any sensor's range)
+are excluded and returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is
+replaced by the recipe's, or by the median of the stated ones where that is larger; one that is too small is raised to a
+floor: a zero covariance is not trust. Coordinates with few decimals err by rounding besides.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _JITTER_STEPS = 41  # pairs of fixes in a window of the estimate of jitter
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """How a stream was prepared: stamps of rows without use, rows of a repeated stamp, variances replaced; and findings."""
+    """Result of preparing a stream: stamps of unusable rows, repeated rows, replaced variances; and findings."""
 
     invalid_ns: Ints
     repeated: int = 0
@@ -64,7 +64,7 @@ class Prepared:
 
 @dataclass(frozen=True, slots=True)
 class Repeats:
-    """Measurements that repeat one value while the robot drives: stamps of the first and the last [ns], and how many repeat it."""
+    """Measurements that repeat a value while the robot drives: first and last stamp [ns], and their number."""
 
     start_ns: int
     end_ns: int
@@ -72,7 +72,7 @@ class Repeats:
 
 
 def find_datum(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> tuple[float, float, float] | None:
-    """Return longitude [deg], latitude [deg], height [m]: the median of the first ten fixes; None where there is none."""
+    """Return longitude [deg], latitude [deg], height [m]: the median of the first ten fixes; None without fixes."""
     usable = np.flatnonzero(_is_fix(lon_deg, lat_deg, alt_m))[:10]
     if usable.size == 0:
         return None
@@ -98,7 +98,7 @@ def prepare_positions(
     floor_std_m: float,
     mounting_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
 ) -> tuple[Positions, Prepared]:
-    """Prepare GNSS fixes (columns of the role gnss); unknown variances: ``default_std_m`` horizontally, twice that vertically.
+    """Prepare GNSS fixes (columns of the role gnss); unknown σ: ``default_std_m`` horizontally, twice vertically.
 
     Or a pose (columns of the role pose), whose sensor is turned by ``mounting_xyzw`` to base_link.
     """
@@ -125,10 +125,10 @@ def prepare_positions(
 
 
 def _compute_rounding_variances(values: Floats) -> Floats:
-    """Return the variance of rounding along each axis of values (N, k), shape (k,): grid²/12 times how many rows in turn have one value.
+    """Return the variance of rounding by axis of values (N, k), shape (k,): grid²/12 times the rows per value.
 
-    All axes have one grid: the smallest step between their values, of which every step is a multiple. Rows with one value have one error,
-    which does not average out; it is below the grid.
+    All axes have one grid: the smallest step between their values, of which every step is a multiple. Rows with one
+    value have one error, which does not average out; it is below the grid.
     """
     steps = np.concatenate([np.diff(np.unique(axis.round(10))) for axis in values.T])  # binary numbers differ by less
     multiples = steps / steps.min() if steps.size >= _FEWEST else np.array([0.5])
@@ -139,10 +139,11 @@ def _compute_rounding_variances(values: Floats) -> Floats:
 
 
 def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tuple[Positions, tuple[Repeats, ...]]:
-    """Return the fixes without those that repeat the one before to the last digit, and where they do while the robot drives.
+    """Return the fixes without exact repetitions of the one before, and where these occur while the robot drives.
 
-    They carry no information: a receiver hangs, or a slow one is published at a higher rate. Without odometry a robot may be stationary
-    where fixes repeat for a second and two of their periods: they are kept. So are fixes that never change.
+    They carry no information: a receiver hangs, or a slow one is published at a higher rate. Without odometry a robot
+    may be stationary where fixes repeat for a second and two of their periods: they are kept. So are fixes that never
+    change.
     """
     stamp_ns = gnss.stamp_ns
     changes = np.concatenate(([True], (np.diff(gnss.position_enu_m, axis=0) != 0.0).any(1)))
@@ -164,12 +165,13 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
 
 
 def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Positions, Floats]:
-    """Return the fixes with variances raised where their stamps jitter, and the standard deviation of the stamps at each [s], (N,).
+    """Return the fixes with variances raised for jitter of stamps, and the σ of each stamp [s], shape (N,).
 
-    A fix that is stamped when it is sent seems to stand still and then to leap. The distance between two fixes is compared with that of the
-    odometry, times the local ratio of the two (slip). The scatter of this residual beyond the stated noise, over the speed, is the jitter:
-    0 where it is small or unknown, and that of the nearest motion while the robot is stationary. The variance grows by (2 speed jitter)²:
-    late fixes follow each other, and a filter of white errors must not average them.
+    A fix that is stamped when it is sent seems to stand still and then to leap. The distance between two fixes is
+    compared with that of the odometry, times the local ratio of the two (slip). The scatter of this residual beyond the
+    stated noise, over the speed, is the jitter: 0 where it is small or unknown, and that of the nearest motion while
+    the robot is stationary. The variance grows by (2 speed jitter)²: late fixes follow each other, and a filter of
+    white errors must not average them.
     """
     zero = int(gnss.stamp_ns[0])
     stamp_s, odometry_s = compute_seconds(gnss.stamp_ns, zero), compute_seconds(odometry.stamp_ns, zero)
@@ -200,8 +202,8 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
 def inflate_late_fixes(gnss: Positions, late_s: float) -> Positions:
     """Return fixes with variances raised where their receiver is late [s] and therefore probably filters its positions.
 
-    A first-order low-pass of time τ delays positions by τ; once that is corrected, they are off by τ² times the acceleration. Correlation
-    with speeds shows a delay below τ, so that the rest may be as long as the delay.
+    A first-order low-pass of time τ delays positions by τ; once that is corrected, they are off by τ² times the
+    acceleration. Correlation with speeds shows a delay below τ, so that the rest may be as long as the delay.
     """
     if late_s < 0.2:
         return gnss
@@ -221,7 +223,7 @@ def _make_windows(values: Floats) -> Floats:
 def prepare_ground_velocities(
     stamp_ns: Ints, columns: Columns, *, default_std_mps: float
 ) -> tuple[GroundVelocities, Prepared]:
-    """Prepare a receiver's velocities (columns of the role gnss_velocity); unknown variances: ``default_std_mps``, twice that for up."""
+    """Prepare a receiver's velocities (columns of the role gnss_velocity); unknown σ: ``default_std_mps``, twice up."""
     velocity = _stack_columns(columns, [f"{axis}_velocity_mps" for axis in ("east", "north", "up")])
     variance = _stack_columns(columns, [f"{axis}_var_m2ps2" for axis in ("east", "north", "up")])
     measured = np.asarray(np.isfinite(velocity[:, :2]).all(1) & ~(np.abs(velocity) >= _MAX_VELOCITY_MPS).any(1))
@@ -243,11 +245,11 @@ def prepare_body_velocities(
     default_std_mps: float,
     only_forward: bool,
 ) -> tuple[BodyVelocities, Prepared]:
-    """Prepare an odometry (columns of the roles wheel_odometry and visual_odometry), whose child frame has the extrinsics given.
+    """Prepare an odometry (columns of wheel_odometry or visual_odometry), whose child frame has the given extrinsics.
 
-    Its twist is used where it has one. One that has no forward velocity, or is zero throughout while the poses move, is none: the velocity
-    is then that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. Of wheels
-    ``only_forward`` velocity, along base_link's x, is measured.
+    Its twist is used where it has one. One that has no forward velocity, or is zero throughout while the poses move, is
+    none: the velocity is then that of the increment from pose to pose, in the middle of the two stamps, in the axes
+    half-way between the two. Of wheels ``only_forward`` velocity, along base_link's x, is measured.
     """
     pose = _stack_columns(columns, ("x_m", "y_m", "z_m"))
     velocity = _stack_columns(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
@@ -291,7 +293,7 @@ def _find_orientation_rates(of_orientation: Mask, subject: Subject) -> list[Find
 
 
 def _rotate_vectors(matrix: Floats, values: Floats) -> Floats:
-    """Return ``matrix`` (3, 3) times vectors (N, 3); NaN, what is not measured, makes each axis NaN into which it turns."""
+    """Return ``matrix`` (3, 3) times vectors (N, 3); an axis is NaN if an unmeasured component contributes to it."""
     unknown = np.isnan(values)
     turned = np.where(unknown, 0.0, values) @ matrix.T
     return np.where(unknown @ (np.abs(matrix).T > 0.1), np.nan, turned)
@@ -306,9 +308,10 @@ def prepare_imu(
     gyro_std_radps: float,
     accelerometer_std_mps2: float,
 ) -> tuple[InertialMeasurements, Prepared]:
-    """Prepare an IMU (columns of the role imu): turned into base_link axes, moved to base_link, its specific force checked for being one.
+    """Prepare an IMU (columns of the role imu): rotate and move it to base_link, and check its specific force.
 
-    The noise is the one given or, where that is larger, that of the samples: motion too fast for the unit's rate counts as noise.
+    The noise is the one given or, where that is larger, that of the samples: motion too fast for the unit's rate counts
+    as noise.
     """
     rate = _stack_columns(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     force = _stack_columns(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
@@ -360,8 +363,8 @@ def _read_orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, f
 def _move_to_base_link(stamp_ns: Ints, turn_radps: Floats, force_mps2: Floats, lever_m: Floats) -> None:
     """Subtract the acceleration of the unit relative to base_link, dw x l + w x (w x l) [m/s²], in base_link axes.
 
-    The angular acceleration dw is the slope of a line through five samples (Savitzky and Golay 1964): its noise, added over time, cancels
-    out.
+    The angular acceleration dw is the slope of a line through five samples (Savitzky and Golay 1964): its noise, added
+    over time, cancels out.
     """
     if stamp_ns.size < 5 or not lever_m.any():
         return
@@ -374,7 +377,7 @@ def _move_to_base_link(stamp_ns: Ints, turn_radps: Floats, force_mps2: Floats, l
 
 
 def _estimate_local_noise(stamp_ns: Ints, values: Floats) -> Floats:
-    """Return the σ of the white noise over two seconds around each sample, the largest of the axes, shape (N,); 0 where few are near."""
+    """Return the σ of white noise over two seconds around each sample, largest axis, shape (N,); 0 for few samples."""
     largest = np.zeros(stamp_ns.size)
     for axis in values.T if stamp_ns.size > 2 else ():
         square = np.square(np.diff(axis, n=2))[:, None] / 6.0
@@ -401,7 +404,7 @@ def _is_known(variance: Floats) -> Mask:
 
 
 def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[Floats, int]:
-    """Return usable variances (N, k), and how many rows had one replaced: by the default, or the median of the known if that is larger."""
+    """Return usable variances (N, k), and the number of rows with a replaced one: default, or median if larger."""
     known = _is_known(variance)
     usual = [np.median(axis[rows]) if rows.any() else 0.0 for axis, rows in zip(variance.T, known.T, strict=True)]
     filled = np.clip(np.where(known, variance, np.maximum(default, usual)), floor, NO_TRUST)
@@ -412,7 +415,7 @@ _MAX_INCREMENT_S = 1.0  # longer increments give no velocity
 
 
 def has_twist(velocity_mps: Floats, pose_m: Floats) -> bool:
-    """Return whether the velocities are measurements: finite somewhere, and not zero throughout while the poses move."""
+    """Return whether the velocities are measurements: finite, and not all zero while the poses move."""
     posed = pose_m[np.isfinite(pose_m).all(1)]
     moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > 0.1  # m: less may be noise
     return bool(np.isfinite(velocity_mps).any() and (np.nan_to_num(velocity_mps).any() or not moves))
@@ -436,8 +439,8 @@ def compute_increments(stamp_ns: Ints, pose_m: Floats, quat_xyzw: Floats) -> tup
 def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Floats) -> tuple[Floats, Mask]:
     """Return angular velocities, shape (N, 3), and which axes of them are by the orientation, shape (3,).
 
-    Those are the axes about which it turns while ``rate_radps``, in the child frame, is missing or zero throughout. ``stamp_ns`` does not
-    decrease; NaN is not measured.
+    Those are the axes about which it turns while ``rate_radps``, in the child frame, is missing or zero throughout.
+    ``stamp_ns`` does not decrease; NaN is not measured.
     """
     zero = (np.nan_to_num(rate_radps) == 0.0).all(axis=0)
     known = np.flatnonzero(np.isfinite(quat_xyzw).all(axis=1))

@@ -1,8 +1,8 @@
 """Process noise of the filters: noise densities, most of them estimated from the sensors themselves.
 
-White noise of standard deviation s at f Hz has the density s²/f. What changes along the drive is the density of the velocity's noise, one
-number an event. With an accelerometer it is that of its noise, which vibration multiplies while the robot moves. Without one, where the
-body velocity is held, it follows how fast the forward velocity changes there.
+White noise of standard deviation s at f Hz has the density s²/f. What changes along the drive is the density of the
+velocity's noise, one number an event. With an accelerometer it is that of its noise, which vibration multiplies while
+the robot moves. Without one, where the body velocity is held, it follows how fast the forward velocity changes there.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def is_turned_by_course(m: Measurements) -> bool:
 
 
 def turn_scale_std(measurements: Measurements) -> float:
-    """Return the standard deviation of the scale of the turn rate: of the gyroscope, else of an odometry; 0 without either.
+    """Return the standard deviation of the turn rate's scale: of the gyroscope, else of an odometry; else 0.
 
     Without fixes nothing shows it: it stays 1.
     """
@@ -70,7 +70,7 @@ def turn_scale_std(measurements: Measurements) -> float:
 
 
 def is_length_observable(m: Measurements, fixes: SensorNoise | None) -> bool:
-    """Return whether fixes show, on the ground that they span, how long a metre of odometry is, twice as well as it is known.
+    """Return whether fixes determine the scale of odometry, by the ground that they span, twice as well as known.
 
     Else an accelerometer would show it, whose errors pass for a scale. The white noise of many fixes averages out.
     """
@@ -89,8 +89,8 @@ def find_best_scale_std(m: Measurements) -> float:
 def find_scale_stds(measurements: Measurements, fixes: SensorNoise | None) -> Mapping[str, float]:
     """Return the standard deviations of the scales of odometries by role; 0 where a scale is unobservable: it stays 1.
 
-    Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else the wheels. What an
-    accelerometer adds up to over a minute is its tilt and its bias.
+    Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else
+    the wheels. What an accelerometer adds up to over a minute is its tilt and its bias.
     """
     if is_length_observable(measurements, fixes):
         return SCALE_STD
@@ -100,7 +100,7 @@ def find_scale_stds(measurements: Measurements, fixes: SensorNoise | None) -> Ma
 def make_motion_noise(  # noqa: PLR0917
     m: Measurements, noise: NoiseModel, stamp_ns: Ints, mode: NDArray[np.int8], rate_radps: Floats, period_s: float
 ) -> Floats:
-    """Return the variance that motion adds over the tick before each stamp, of rotation [rad²] and body velocity [m²/s²], shape (K, 6).
+    """Return the variance added by motion over the tick before each stamp: rotation [rad²], velocity [m²/s²], (K, 6).
 
     ``mode`` and ``rate_radps`` are those of the tick, as `tcpipe.fusion.state.move_state` takes them.
     """
@@ -136,7 +136,8 @@ def _make_turn_density(
 ) -> Floats:
     """Return the noise density of turns that no gyroscope measures [rad²/s], shape (K, 3).
 
-    The scale of an odometry's turn rate is off by the variation of `PRIORS` for a second at a time, beside what is constant of it.
+    The scale of an odometry's turn rate is off by the variation of `PRIORS` for a second at a time, beside what is
+    constant of it.
     """
     density = np.full((mode.size, 3), 5e-7)  # at least a tenth of a degree in a second
     ground = np.full(mode.size, 0.0 if m.is_antenna_alone else GROUND)
@@ -153,7 +154,7 @@ def _make_turn_density(
 
 
 def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:
-    """Return the noise density without an accelerometer: the square of the acceleration around a stamp, times how long it lasts.
+    """Return the noise density without accelerometer: squared acceleration around a stamp times its duration.
 
     Where two odometries differ, the one that shows the least of it is right: wheels that dig in show much.
     """
@@ -168,9 +169,10 @@ def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:
 
 
 def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
-    """Return the noise density without odometry: the square of the acceleration that a receiver shows, times how long it lasts.
+    """Return the noise density without odometry: squared acceleration of a receiver times its duration.
 
-    An acceleration between slow fixes lasts from one to the next. Fixes too noisy to show a velocity do not show how steady it is.
+    An acceleration between slow fixes lasts from one to the next. Fixes too noisy to show a velocity do not show how
+    steady it is.
     """
     source, least = m.doppler or m.gnss, 0.0
     if source is None or source.stamp_ns.size < 5:
@@ -185,8 +187,8 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     else:
         std, order = float(np.sqrt(np.median(source.variance_m2ps2[:, :2]))), 1
         axes = [source.velocity_enu_mps[:, 0], source.velocity_enu_mps[:, 1]]
-    # The slope of a line through the samples of a window has √12 times their noise over √(samples), and over the window. It is to show
-    # 0.15 m/s², 1σ: half of the change that masks look for.
+    # The slope of a line through the samples of a window has √12 times their noise over √(samples), and over the
+    # window. It is to show 0.15 m/s², 1σ: half of the change that masks look for.
     window_s = max(3.0 * period_s, (12.0 ** (order / 2.0) * std * period_s**0.5 / 0.15) ** (1.0 / (order + 0.5)))
     for _ in range(order):
         axes = [compute_slopes(source.stamp_ns, axis, window_s) for axis in axes]

@@ -1,4 +1,4 @@
-"""Sampled signals between their samples: integrals, means, values at other stamps, and gaps; and the thresholds of χ² gates."""
+"""Sampled signals: integrals, means, values at other stamps, and gaps; and the thresholds of χ² gates."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def compute_seconds(stamp_ns: Ints | int, zero_ns: int) -> Floats:
 
 
 def integrate_signal(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
-    """Return the integral [u s], shape (M, k), from the first sample on to ``at_s``, of the linear interpolation [u] of (N, k) samples.
+    """Return the integral [u s], shape (M, k), from the first sample to ``at_s``, of linearly interpolated (N, k) [u].
 
     Stamps [s] increase, N >= 1; before the first and after the last sample values are held.
     """
@@ -48,7 +48,7 @@ def integrate_signal(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
 
 
 def compute_interval_means(stamp_s: Floats, values: Floats, start_s: Floats, end_s: Floats) -> Floats:
-    """Return the mean of the piecewise-linear signal over each interval, shape (M, k); its value where the interval is empty."""
+    """Return the mean of the piecewise-linear signal over each interval, shape (M, k); its value in empty ones."""
     width = (end_s - start_s)[:, None]
     mean = (integrate_signal(stamp_s, values, end_s) - integrate_signal(stamp_s, values, start_s)) / np.where(
         width > 0, width, 1.0
@@ -62,7 +62,7 @@ def interpolate_signal(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
 
 
 def is_in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) -> NDArray[np.bool_]:
-    """Return whether each interval touches a span between samples longer than ``longest_ns``, or lies outside the samples.
+    """Return whether each interval touches a span between samples above ``longest_ns``, or is outside the samples.
 
     Half that long outside the first and last sample is still inside.
     """
@@ -88,7 +88,7 @@ def find_longest_step_ns(stamp_ns: Ints, least_ns: int) -> int:
 
 
 def hold_last(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
-    """Return the last value at or before each stamp, shape (M,); NaN where it is older than 1 s and three periods, or none is known."""
+    """Return the last value at or before each stamp, (M,); NaN if older than 1 s and three periods, or unknown."""
     if not values.size:
         return np.full(at_ns.size, np.nan)
     index = np.searchsorted(stamp_ns, at_ns, "right") - 1
@@ -115,7 +115,7 @@ def compute_window_means(stamp_ns: Ints, values: Floats, at_ns: Ints, window_ns:
 
 
 def compute_running_median(values: Floats, rows: int = 5) -> Floats:
-    """Return the median of an odd number of rows around each of a signal (N, ...), its ends repeated: single outliers vanish."""
+    """Return the running median over an odd number of rows of a signal (N, ...), with its ends repeated."""
     if len(values) < rows:
         return values
     padded = np.pad(values, [(rows // 2, rows // 2)] + [(0, 0)] * (values.ndim - 1), mode="edge")
@@ -123,7 +123,7 @@ def compute_running_median(values: Floats, rows: int = 5) -> Floats:
 
 
 def remove_spikes(values: Floats, *, fill: float | None = None) -> Floats:
-    """Return a signal (N,) with samples far off the median of five around them, what a filter's gate rejects, interpolated or filled."""
+    """Return a signal (N,) with samples far from the median of five (beyond a filter's gate) interpolated or filled."""
     if values.size < 5:
         return values
     off = np.abs(values - compute_running_median(values))
@@ -153,7 +153,7 @@ def remove_wild_places(position_m: Floats) -> Plane:
 
 
 def compute_slopes(stamp_ns: Ints, values: Floats, window_s: float) -> Floats:
-    """Return the slope [u/s] at each sample of the line through the samples within half a window, shape (N,); 0 where there is one only."""
+    """Return the slope [u/s] at each sample of the line through samples within half a window, (N,); 0 for one."""
     t, centred = compute_seconds(stamp_ns, int(stamp_ns[0])), values - values.mean()
     products = np.column_stack((t, centred, t * t, t * centred))
     time, value, square, product = compute_window_means(stamp_ns, products, stamp_ns, round(1e9 * window_s)).T
@@ -162,7 +162,7 @@ def compute_slopes(stamp_ns: Ints, values: Floats, window_s: float) -> Floats:
 
 
 def estimate_white_noise(values: Floats) -> float:
-    """Estimate the standard deviation of white noise on a signal (N, k), the largest of its axes; 0 for fewer than three samples.
+    """Estimate the σ of white noise on a signal (N, k), the largest of its axes; 0 for fewer than three samples.
 
     The second difference of white noise has sqrt(6) times its standard deviation.
     """
@@ -195,12 +195,12 @@ def _compute_chi_square_tail(freedom: int, value: float) -> float:
 
 
 def multiply_by_vector(matrix: Floats, vector: Floats) -> Floats:
-    """Return the product of a large matrix (M, C) and a vector (C,), the same bits whatever the number of threads of the BLAS."""
+    """Return the product of a large matrix (M, C) and a vector (C,), bit-identical for any number of threads."""
     return np.asarray(np.einsum("mc,c->m", matrix, vector))
 
 
 def solve_least_squares(matrix: Floats, target: Floats) -> Floats:
-    """Return the least-squares solution of M equations, shape (C,), of least norm; the same bits as `multiply_by_vector` says."""
+    """Return the least-squares solution of M equations, shape (C,), of least norm, by `multiply_by_vector`."""
     normal = np.einsum("mi,mj->ij", matrix, matrix)
     solved: Floats = np.linalg.lstsq(normal, np.einsum("mi,m->i", matrix, target), rcond=1e-13)[0]
     return solved

@@ -1,18 +1,20 @@
 """Backward pass of the error-state filter: its smoother.
 
-The smoother is that of Bryson and Frazier in the form of Bierman: it inverts no covariance, so parameters may be known exactly. Back in
-time over each update (gain K, innovation y of covariance S; G turns the axes of the error with the correction) and each motion F::
+The smoother is that of Bryson and Frazier in the form of Bierman: it inverts no covariance, so parameters may be known
+exactly. Back in time over each update (gain K, innovation y of covariance S; G turns the axes of the error with the
+correction) and each motion F::
 
     l ← G' l, Λ ← G' Λ G    l ← (I - K H)' l - H' S⁻¹ y,  Λ ← (I - K H)' Λ (I - K H) + H' S⁻¹ H    l ← F' l, Λ ← F' Λ F
     x_s = x - P l    P_s = P - P Λ P    cov(d_j, d_k) = P_j (product of all transitions from j to k)' (I - Λ_k P_k),  j < k
 
-On its way back the adjoint shows how much an event at a tick would explain. Restricted to the errors that the event changes, with
-S = diag(σ) of the change::
+On its way back the adjoint shows how much an event at a tick would explain. Restricted to the errors that the event
+changes, with S = diag(σ) of the change::
 
     B = I + S Λ S    z = chol(B)⁻¹ S l    log evidence = |z|² / 2 - log |B| / 2    change = -S B⁻¹ S l
 
-References: G. J. Bierman, "Fixed interval smoothing with discrete measurements", International Journal of Control 18 (1), 1973; P. de Jong,
-J. Penzer, "Diagnosing shocks in time series", Journal of the American Statistical Association 93 (442), 1998.
+References: G. J. Bierman, "Fixed interval smoothing with discrete measurements", International Journal of Control 18
+(1), 1973; P. de Jong, J. Penzer, "Diagnosing shocks in time series", Journal of the American Statistical Association 93
+(442), 1998.
 """
 
 from __future__ import annotations
@@ -32,10 +34,11 @@ class Candidates(NamedTuple):
 
     Attributes
     ----------
-    places, stds, sizes : by event, places in `Model.active` of the errors that it changes, standard deviations of the change, (C, 9),
-        and how many errors those are, (C,).
+    places, stds, sizes : by event, places in `Model.active` of the errors that it changes, standard deviations of the
+        change, (C, 9), and how many errors those are, (C,).
     earliest : first tick of an event.
-    best : by event, the largest log evidence of all ticks, its tick, the change, and its standard deviation, (C, 20); to be filled.
+    best : by event, the largest log evidence of all ticks, its tick, the change, and its standard deviation, (C, 20);
+    to be filled.
     """
 
     places: Indices
@@ -52,8 +55,9 @@ class Smoothed(NamedTuple):
     ----------
     states : x, (K, 51).
     variances : of the position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], (K, 5).
-    links : variance of the horizontal displacement, along its direction, from a tick to the one each of the lags later [m²], (K, l); NaN
-        where it was not computed: it is at every `NEAR_EVERY` ticks, for lags beyond `NEAR` at every `FAR_EVERY`.
+    links : variance of the horizontal displacement, along its direction, from a tick to the one each of the lags later
+        [m²], (K, l); NaN where it was not computed: it is at every `NEAR_EVERY` ticks, for lags beyond `NEAR` at every
+        `FAR_EVERY`.
     spreads : standard deviation of every active error every `SELDOM` ticks, (K / SELDOM, n).
     """
 
@@ -74,8 +78,10 @@ class Adjoint(NamedTuple):
     Attributes
     ----------
     information : Λ, (n, n).
-    rows : l, and for each of Q ticks ahead the columns of I - Λ P that belong to its position east and north, (1 + 2 Q, n).
-    ticks : of those ticks, (Q,); -1: none. Every `NEAR_EVERY` as far as `NEAR`, then every `FAR_EVERY` as far as the longest lag.
+    rows : l, and for each of Q ticks ahead the columns of I - Λ P that belong to its position east and north, (1 + 2 Q,
+    n).
+    ticks : of those ticks, (Q,); -1: none. Every `NEAR_EVERY` as far as `NEAR`, then every `FAR_EVERY` as far as the
+    longest lag.
     ends : of those ticks, position east and north, and their smoothed covariance (ee, en, nn), (Q, 5).
     near : so many of Q are those up to `NEAR`.
     """
@@ -88,7 +94,7 @@ class Adjoint(NamedTuple):
 
 
 def make_adjoint(size: int, longest: int) -> Adjoint:
-    """Return the adjoint at the last tick, of ``size`` errors, for lags up to ``longest`` ticks; 0: no displacements are wanted."""
+    """Return the adjoint at the last tick, of ``size`` errors, for lags up to ``longest`` ticks (0: none)."""
     near = NEAR // NEAR_EVERY + 1 if longest else 0
     ahead = near + longest // FAR_EVERY + 1 if longest else 0
     rows = np.zeros((1 + 2 * ahead, size))
@@ -174,7 +180,8 @@ def step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint
                 s = information[i, j]
                 information[i, j] = information[j, i]
                 information[j, i] = s
-    # The step over an update takes Λ for symmetric: an asymmetry by rounding would grow to the size of Λ within half an hour.
+    # The step over an update takes Λ for symmetric: an asymmetry by rounding would grow to the size of Λ within half an
+    # hour.
     for i in range(n):
         for j in range(i):
             information[i, j] = information[j, i] = 0.5 * (information[i, j] + information[j, i])

@@ -1,22 +1,23 @@
-"""State of the error-state filter: its layout, errors on its manifold, motion over a tick, and what each sensor measures of it.
+"""State of the error-state filter: layout, errors on its manifold, motion over a tick, and measurement models.
 
-The state is the pose ``X = (R, p)`` of the robot in ENU, its velocity ``u`` in body axes, the biases of gyroscope and accelerometer, and
-the parameters of `tcpipe.fusion.parameters`. Its error ``d`` is a vector::
+The state is the pose ``X = (R, p)`` of the robot in ENU, its velocity ``u`` in body axes, the biases of gyroscope and
+accelerometer, and the parameters of `tcpipe.fusion.parameters`. Its error ``d`` is a vector::
 
     R = R̂ Exp(θ)    p = p̂ + R̂ ρ    every other entry: its estimate plus its error
 
-Motion over a tick of T seconds, with the preintegrated rotation D, velocity v and displacement s of the IMU (biases subtracted)::
+Motion over a tick of T seconds, with the preintegrated rotation D, velocity v and displacement s of the IMU (biases
+subtracted)::
 
     R⁺ = R D    p⁺ = p + R (u T + s) + g T² / 2    u⁺ = D' (u + R' g T + v)
 
-so an unknown tilt does not shorten the path, and a constant velocity of the body stays one while it turns. Without a usable
-accelerometer ``u`` is kept.
+so an unknown tilt does not shorten the path, and a constant velocity of the body stays one while it turns. Without a
+usable accelerometer ``u`` is kept.
 
 Layout: ``x`` is flat, R row by row in 0:9; entry e of the errors (e >= 3) is entry e + 6 of ``x``.
 
-References: A. Barrau, S. Bonnabel, "The invariant extended Kalman filter as a stable observer", IEEE TAC 62 (4), 2017; M. Brossard,
-A. Barrau, S. Bonnabel, "A code for unscented Kalman filtering on manifolds (UKF-M)", ICRA 2020; C. Forster et al., "On-manifold
-preintegration for real-time visual-inertial odometry", IEEE T-RO 33 (1), 2017.
+References: A. Barrau, S. Bonnabel, "The invariant extended Kalman filter as a stable observer", IEEE TAC 62 (4), 2017;
+M. Brossard, A. Barrau, S. Bonnabel, "A code for unscented Kalman filtering on manifolds (UKF-M)", ICRA 2020; C. Forster
+et al., "On-manifold preintegration for real-time visual-inertial odometry", IEEE T-RO 33 (1), 2017.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from tcpipe.compiled import compile_kernel
 GRAVITY_MPS2 = 9.80665  # standard gravity (CGPM 1901)
 
 N, MOVING, NX = 45, 15, 51
-"""Errors; the first of them, which move with the robot (those from `Error.ARM` on stay or decay); entries of the state."""
+"""Number of errors; of those that move with the robot (from `Error.ARM` on they stay or decay); of state entries."""
 
 
 class Error(IntEnum):
-    """First place of each part of the errors; from ``ARM`` on `tcpipe.fusion.parameters.PARAMETERS` has their meaning."""
+    """First place of each part of the errors; `tcpipe.fusion.parameters.PARAMETERS` has the meaning from ``ARM`` on."""
 
     THETA, RHO, U, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
     ARM, FIX_LAG, FIX_ERROR, FIX_OFFSET = 15, 18, 19, 22
@@ -48,8 +49,8 @@ class Error(IntEnum):
 class Kind(IntEnum):
     """Kinds of measurements.
 
-    SIDEWAYS: sideways and upward velocity of the turning centre are about zero; STATIONARY: the velocity, and STATIONARY_RATE: the
-    gyroscope's rate less its bias; LEVEL: roll and pitch are small; ATTITUDE: that of a pose.
+    SIDEWAYS: sideways and upward velocity of the turning centre are about zero; STATIONARY: the velocity, and
+    STATIONARY_RATE: the gyroscope's rate less its bias; LEVEL: roll and pitch are small; ATTITUDE: that of a pose.
     """
 
     WHEELS, SIDEWAYS, VISUAL, STATIONARY, STATIONARY_RATE, LEVEL, DOPPLER, FIX, ATTITUDE = range(9)
@@ -61,7 +62,7 @@ SIZES = (1, 2, 3, 3, 3, 2, 3, 3, 3)
 
 
 class Mode(IntEnum):
-    """What tells how the robot moves over a tick: the turn of wheels or course, that of a camera, a gyroscope, a whole IMU."""
+    """Source of motion over a tick: turn of wheels or course, of a camera, a gyroscope, or a whole IMU."""
 
     FLAT_TURN, VISUAL_TURN, GYRO_TURN, INERTIAL = range(4)
 
@@ -112,7 +113,7 @@ def displace_state(x: Vector, d: Vector, sign: float, out: Vector, turn: Vector)
 
 @compile_kernel
 def compute_rotation_error(y: Vector, x: Vector, out: Vector) -> None:
-    """Fill the first 3 of ``out`` with the rotation vector from ``x`` to ``y``, of which the first 9 are rotation matrices."""
+    """Fill the first 3 of ``out`` with the rotation vector from ``x`` to ``y``, whose first 9 are rotation matrices."""
     a = b = c = 0.0
     trace = -1.0
     for k in range(3):  # antisymmetric part and trace of Rx' Ry
@@ -143,8 +144,8 @@ def compute_moving_error(y: Vector, x: Vector, out: Vector) -> None:
 def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, out: Vector, turn: Vector) -> None:
     """Fill ``out`` with the state after a tick of T seconds.
 
-    ``turned``: rotation matrix over the tick by the gyroscope, or the rotation vector by an odometry; ``gained``: velocity and
-    displacement by the accelerometer, shape (6,). Both with the biases and the scale still in them.
+    ``turned``: rotation matrix over the tick by the gyroscope, or the rotation vector by an odometry; ``gained``:
+    velocity and displacement by the accelerometer, shape (6,). Both with the biases and the scale still in them.
     """
     if mode >= Mode.GYRO_TURN:
         s = 0.5 * x[Error.TURN_SCALE + 6]  # half of the antisymmetric part is the rotation vector of a small turn
@@ -191,7 +192,7 @@ def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, o
 
 @compile_kernel
 def _predict_attitude(x: Vector, w0: float, w1: float, w2: float, t: float, measured: Vector, out: Vector) -> None:
-    """Fill ``out`` with the rotation from a measured attitude to that of a state, t seconds later at the angular velocity w."""
+    """Fill ``out`` with the rotation from a measured attitude to that of a state t seconds later at angular rate w."""
     one, other, turn = np.empty(9), np.empty(9), np.empty(9)
     make_rotation(t * w0, t * w1, t * w2, turn)
     multiply_rotations(x, turn, one)
@@ -211,9 +212,9 @@ def predict_measurement(
 ) -> None:  # fmt: skip
     """Fill ``out`` with what a sensor measures of a state.
 
-    ``rate``: angular velocity at the tick, bias or scale not removed; ``acceleration``: time derivative of ``u``; ``tau``: time of the
-    measurement after the tick [s]; ``lever``: place of an odometry on the robot. A pose measures its own attitude, the rotation vector
-    ``lever``: what is predicted is the rotation from there.
+    ``rate``: angular velocity at the tick, bias or scale not removed; ``acceleration``: time derivative of ``u``;
+    ``tau``: time of the measurement after the tick [s]; ``lever``: place of an odometry on the robot. A pose measures
+    its own attitude, the rotation vector ``lever``: what is predicted is the rotation from there.
     """
     if kind == Kind.STATIONARY:
         out[0], out[1], out[2] = x[Error.U + 6], x[Error.U + 7], x[Error.U + 8]

@@ -1,11 +1,12 @@
-"""What a section measures, tick by tick of the track: motion between ticks, and at each tick the mean of each sensor's measurements.
+"""Measurements of a section by tick of the track: motion between ticks, and the mean of each sensor at each tick.
 
-Ticks are the multiples of the track's period, or of a part of it that is at most 50 ms long. A sensor that measures several times a tick
-gives the mean of value and stamp. Late messages are no problem offline: everything is in order of its stamp of measurement.
+Ticks are the multiples of the track's period, or of a part of it that is at most 50 ms long. A sensor that measures
+several times a tick gives the mean of value and stamp. Late messages are no problem offline: everything is in order of
+its stamp of measurement.
 
-Two constraints are measurements of our own making: the turning centre of the robot moves neither sideways nor upward; and a robot that
-is stationary (`tcpipe.fusion.initial`) has no velocity, and its gyroscope shows its bias. Where no accelerometer shows up and down, roll
-and pitch are small.
+Two constraints are measurements of our own making: the turning centre of the robot moves neither sideways nor upward;
+and a robot that is stationary (`tcpipe.fusion.initial`) has no velocity, and its gyroscope shows its bias. Where no
+accelerometer shows up and down, roll and pitch are small.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def find_tick_period_ns(period_ns: int) -> int:
 def build_ticks(  # noqa: C901, PLR0915  one array after the other
     m: Measurements, noise: NoiseModel, stationary_ns: Ints, start_ns: int, end_ns: int, *, output_ns: Ints
 ) -> Ticks:
-    """Return the ticks from that before ``start_ns`` to that after ``end_ns``; ``stationary_ns``, shape (S, 2), are stops [ns].
+    """Return the ticks from before ``start_ns`` to after ``end_ns``; ``stationary_ns``, shape (S, 2), are stops [ns].
 
     Every wanted stamp (``output_ns``, multiples of the track's period) is a tick.
     """
@@ -193,7 +194,7 @@ def _make_fix_process(noise: NoiseModel, variance_m2: Floats, period_s: float) -
 
 
 def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: NoiseModel, role: str) -> Floats:
-    """Return the variance of each sample: forward by the run's noise, more where more is claimed than usual; others as claimed."""
+    """Return each sample's variance: forward by the run's noise, more if it claims more than usual; else as claimed."""
     rate_hz = 1e9 / compute_median_period_ns(source.stamp_ns)
     claimed = source.variance_m2ps2
     found = claimed.copy()
@@ -216,7 +217,7 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
 
 
 def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, float, float]) -> Floats:
-    """Variance [m²/s²], shape (3,), that turns which no sensor measures cause at a sensor off base_link; they last for a second."""
+    """Variance [m²/s²], (3,), of unmeasured turns at a sensor off base_link; such turns last for a second."""
     x, y, z = np.square(lever_arm_m)
     lasting = max(1.0, 1e9 / compute_median_period_ns(stamp_ns))
     return np.array([z, z, x + y]) * UNSEEN_TURN_RADPS**2 * lasting
@@ -228,7 +229,8 @@ def _add_constraints(
     if m.is_antenna_alone:  # which way the body looks is not known
         return
     value[:, Kind.SIDEWAYS, :2] = 0.0
-    # Sideways velocities are independent after 16 ms: what lasts longer of them is in the states of turning centre and mounting.
+    # Sideways velocities are independent after 16 ms: what lasts longer of them is in the states of turning centre and
+    # mounting.
     variance[:, Kind.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * 0.016 / period_s
     imu = m.imu
     if imu is None or not imu.accelerometer_usable:
@@ -258,7 +260,7 @@ def _add_constraints(
 def _preintegrate(  # noqa: PLR0917, C901  compiled
     t: Floats, w: Floats, f: Floats, ends: Floats, period_s: float, wanted: Ints, turned: Floats, gained: Floats
 ) -> None:
-    """Fill rotation, velocity and displacement over the tick before each wanted end, of samples (s, rad/s, m/s²) linear in between."""
+    """Fill rotation, velocity and displacement over the tick before each end, of linear samples (s, rad/s, m/s²)."""
     r, step, both = np.zeros(9), np.zeros(9), np.zeros(9)
     wm, fm, a = np.zeros(3), np.zeros(3), np.zeros(3)
     v, p = np.zeros(3), np.zeros(3)
@@ -298,7 +300,7 @@ def _preintegrate(  # noqa: PLR0917, C901  compiled
 
 
 def _compute_acceleration(m: Measurements, stamp_ns: Ints) -> Floats:
-    """Return the forward acceleration at each tick by how the velocities of odometries change, their mean; 0 where there is none."""
+    """Return the forward acceleration at each tick by the mean change of odometries' velocities; 0 without one."""
     slopes = [_compute_slope(source, stamp_ns) for source in m.odometries().values()]
     return np.mean(slopes, axis=0) if slopes else np.zeros(stamp_ns.size)
 
@@ -313,7 +315,7 @@ def _compute_slope(source: BodyVelocities, stamp_ns: Ints) -> Floats:
 
 
 def _find_turn_rates(m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int) -> tuple[Floats, NDArray[np.int8]]:
-    """Return the mean angular velocity over each interval by the best source that covers it, and the mode of motion that goes with it."""
+    """Return the mean angular velocity over each interval by the best source that covers it, and its mode of motion."""
     imu = m.imu
     if imu is None:
         return _compute_odometric_turn_rate(m, before_ns, after_ns, zero_ns)
@@ -331,7 +333,7 @@ def _find_turn_rates(m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: 
 def _compute_odometric_turn_rate(
     m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int
 ) -> tuple[Floats, NDArray[np.int8]]:
-    """Return the mean angular velocity by the odometries, shape (K, 3), and the mode; by the course over ground where it alone shows it."""
+    """Return the mean angular velocity by odometries (K, 3), or the course if it is alone, and the mode."""
     rate = np.zeros((before_ns.size, 3))
     mode = np.full(before_ns.size, Mode.FLAT_TURN, np.int8)
     start_s, end_s = compute_seconds(before_ns, zero_ns), compute_seconds(after_ns, zero_ns)

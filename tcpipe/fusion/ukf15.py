@@ -1,9 +1,10 @@
-"""The paper's forward filter (section IV-A): GNSS, wheel odometry, IMU and visual odometry through one unscented Kalman filter.
+"""The paper's forward filter (section IV-A): GNSS, wheels, IMU and visual odometry in an unscented Kalman filter.
 
-Ticks, models of motion and sensors, and their noise are those of the default estimator (`ticks`, `state`, `parameters`). filterpy does
-the scaled unscented transform (E. A. Wan and R. van der Merwe, 2000) of all errors at once: the fifteen of pose, body velocity and
-biases of the IMU, and the parameters that are not known exactly. Each state uses measurements up to its tick; nothing is smoothed, and
-contradictions between sensors are not explained. Noise and start are estimated from the whole section.
+Ticks, models of motion and sensors, and their noise are those of the default estimator (`ticks`, `state`,
+`parameters`). filterpy does the scaled unscented transform (E. A. Wan and R. van der Merwe, 2000) of all errors at
+once: the fifteen of pose, body velocity and biases of the IMU, and the parameters that are not known exactly. Each
+state uses measurements up to its tick; nothing is smoothed, and contradictions between sensors are not explained. Noise
+and start are estimated from the whole section.
 
 The state of filterpy is the error of the estimate, zero between its steps: no angle needs a circle.
 """
@@ -46,7 +47,8 @@ def run_ukf15(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_p
     ----------
     m, initial : one section of a run, and its state at the first measurement.
     output_ns : [ns], shape (N,), increasing multiples of the track's period.
-    gate_probability : a measurement less likely than 1 minus this is rejected (χ² on its squared normalised innovation).
+    gate_probability : a measurement less likely than 1 minus this is rejected (χ² on its squared normalised
+    innovation).
     """
     section = prepare_section(m, output_ns, gate_probability)
     initial = replace(initial, yaw_std_rad=min(initial.yaw_std_rad, _MAX_ANGLE_STD_RAD))
@@ -60,8 +62,8 @@ def run_ukf15(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_p
 def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pass, Smoothed]:
     """Return the forward pass over all ticks, and its estimate, without variances of displacements (NaN).
 
-    If the gate has rejected all measurements of one kind for 5 s (and five of them), the errors that they measure are inflated by the
-    innovation, and the measurement is used.
+    If the gate has rejected all measurements of one kind for 5 s (and five of them), the errors that they measure are
+    inflated by the innovation, and the measurement is used.
     """
     size, period_s = ticks.stamp_ns.size, ticks.inputs.period_s
     ukf, tests = _Filter(ticks, model, start), make_tests(size)
@@ -141,7 +143,7 @@ class _Filter:
         self._correct()
 
     def update(self, k: int, kind: int, gate: float) -> tuple[Floats, float]:
-        """Use one measurement of tick k; return its innovation, and the square of this, normalised. Beyond the gate nothing changes."""
+        """Use one measurement of tick k unless it is beyond the gate; return its innovation and normalised square."""
         inputs, ukf, size, prior = self._inputs, self._ukf, state.SIZES[kind], self.covariance
         lever = inputs.attitude[k] if kind == Kind.ATTITUDE else inputs.levers[kind]
         acceleration = np.array([inputs.acceleration[k], 0.0, 0.0])
@@ -172,7 +174,7 @@ class _Filter:
             self._ukf.P[rows, rows] += np.square([_MAX_ANGLE_STD_RAD, 0.3, 0.3, 0.3])  # m/s: as at the start
 
     def compute_variances(self) -> Floats:
-        """Return the variance of position east, north, up [m²], of yaw [rad²] and of forward velocity [m²/s²], shape (5,)."""
+        """Return the variance of position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], shape (5,)."""
         x, P, yaw = self.x, self.covariance, np.zeros(self._model.active.size)
         yaw[[1, 2]] = np.array([x[7], x[8]]) / max(x[0] ** 2 + x[3] ** 2, 1e-6)  # of atan2(R10, R00) by rotation errors
         if self._model.mount >= 0:  # the robot turns with the IMU and with its mounting
@@ -189,7 +191,7 @@ class _Filter:
         return displaced
 
     def _correct(self) -> None:
-        """Move the error that filterpy has found into the estimate, and turn the axes of rotation and position errors with it."""
+        """Add filterpy's error to the estimate, and rotate the axes of rotation and position errors with it."""
         ukf, turn = self._ukf, np.eye(self._model.active.size)
         # The right Jacobian of SO(3) to second order (Solà 2017, eq. 183).
         for first, share in ((Error.THETA, -0.5), (Error.RHO, -1.0)):

@@ -43,10 +43,10 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class WithheldScore:
-    """Errors against withheld fixes over windows of one length [m], and the share of errors inside the σ that is claimed of them.
+    """Errors against withheld fixes over windows of one length [m], and the share of errors within the claimed σ.
 
-    The values of a window share its errors: ``calibration`` counts a window as one observation. It names a share whose exact binomial 95 %
-    interval excludes that of the normal distribution; fewer than five windows are ``undecided``.
+    The values of a window share its errors: ``calibration`` counts a window as one observation. It names a share whose
+    exact binomial 95 % interval excludes that of the normal distribution; fewer than five windows are ``undecided``.
     """
 
     window_s: float
@@ -80,7 +80,7 @@ def score_comparisons(comparisons: Sequence[Comparison]) -> WithheldScore:
 
 
 def _judge_coverage(within: tuple[float, float], windows: int) -> Calibration:
-    """Compare the shares inside 1σ and 2σ with those of a normal distribution; few windows can share one place or one fault."""
+    """Compare the shares inside 1σ and 2σ with a normal distribution's; few windows can share one place or fault."""
     if windows < 5:
         return "undecided"
     count_1, count_2 = (share * windows for share in within)
@@ -91,7 +91,7 @@ def _judge_coverage(within: tuple[float, float], windows: int) -> Calibration:
 
 
 def place_windows(span_s: float, length_s: float) -> Floats:
-    """Return start and end of windows spread evenly over a span [s], shape (N, 2); as much data as a window is long lies between two."""
+    """Return start and end of even windows of a span [s], shape (N, 2), with a window's length between them."""
     inner_s = span_s - 2.0 * END_S
     count = max(int((inner_s + length_s) / (2.0 * length_s)), 0)
     gap_s = (inner_s - count * length_s) / max(count - 1, 1)
@@ -101,7 +101,7 @@ def place_windows(span_s: float, length_s: float) -> Floats:
 
 
 class TrackRows:
-    """The rows of a track's clock epoch, between which it is interpolated: stamps, and columns of the level TRACK by name."""
+    """The rows of a track's clock epoch, for interpolation: stamps, and columns of the level TRACK by name."""
 
     def __init__(self, stamp_ns: Ints, columns: Mapping[str, Floats], rate_hz: float) -> None:
         self.stamp_ns, self.columns = stamp_ns, columns

@@ -1,7 +1,7 @@
-"""Messages of autopilots as those that roles usually have: PX4 (its msg/ directory) and ArduPilot (LogStructure.h of its libraries).
+"""Messages of autopilots converted to those of roles: PX4 (its msg/ directory) and ArduPilot (LogStructure.h).
 
-Autopilots count time from boot, and use body axes forward, right, down and north, east, down over ground; here they become forward, left,
-up and east, north, up (REP-103). base_link is the origin of the autopilot's body frame.
+Autopilots count time from boot, and use body axes forward, right, down and north, east, down over ground; here they
+become forward, left, up and east, north, up (REP-103). base_link is the origin of the autopilot's body frame.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LeverArms = dict[str, tuple[float, float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Autopilot:
-    """Log of an autopilot: messages by name (those of instances beside the first are called ``name_1`` …), and parameters."""
+    """Log of an autopilot: messages by name (further instances are called ``name_1`` …), and parameters."""
 
     kind: AutopilotKind
     messages: Mapping[str, Stamped]
@@ -39,7 +39,7 @@ class Autopilot:
         return sorted(found for found in self.messages if re.fullmatch(rf"{name}(_\d+)?", found))
 
     def find_last(self, name: str, at_us: Ints, *, within_us: int) -> Columns:
-        """Return the numbers of the last message of a name at or before each time, NaN where that is long ago; {} without any."""
+        """Return the numbers of the last message of a name at or before each time, NaN if old; {} without one."""
         time_us, fields = self.messages.get(name, (None, {}))
         if time_us is None:
             return {}
@@ -54,7 +54,7 @@ class Autopilot:
 
 @dataclass(frozen=True, slots=True)
 class RoleMessages:
-    """A topic that a role can use: its type, times since boot [µs], the message's fields by dotted name, and the sensor's frame."""
+    """A topic for a role: type, times since boot [µs], the message's fields by dotted name, and the sensor's frame."""
 
     topic: str
     type_name: str
@@ -105,7 +105,7 @@ _LISTS = ("gyro_rad", "accelerometer_m_s2", "wheel_speed")
 
 
 def find_lever_arms(parameters: Mapping[str, float]) -> LeverArms:
-    """Return the lever arms of sensors by frame: forward, left and up of base_link [m], as parameters state; all zero states nothing."""
+    """Return stated lever arms of sensors by frame: forward, left and up of base_link [m]; all zero is unstated."""
     found: LeverArms = {}
     for frame, prefixes in _LEVER_ARMS.items():
         stated = ([parameters.get(f"{prefix}_{axis}", 0.0) for axis in "XYZ"] for prefix in prefixes.split())
@@ -118,7 +118,7 @@ _LEVER_ARMS = {"gps": "EKF2_GPS_POS GPS1_POS GPS_POS1 GPS_POS", "imu": "EKF2_IMU
 
 
 def find_utc_offset_us(log: Autopilot) -> int:
-    """Return what a receiver's UTC is ahead of the time since boot [µs], the median over its messages; 0 where none knew the time."""
+    """Return a receiver's UTC minus the time since boot [µs], the median over its messages; 0 if it never knew UTC."""
     _, time_us, fields = _find_receiver(log)
     if "time_utc_usec" in fields:
         utc_us = fields["time_utc_usec"].astype(np.int64)
@@ -133,7 +133,7 @@ def find_utc_offset_us(log: Autopilot) -> int:
 _GPS_TIME = (("GWk", "Week"), ("GMS", "TimeMS"))
 _GPS_BEGAN_MS, _WEEK_MS = 315_964_800_000, 7 * 86_400_000
 _FIRST_US, LATEST_US = 1_100_000_000 * 10**6, 4_000_000_000 * 10**6
-"""Receivers count from an epoch of their own until they know the time; no log is from before 2004, or from after 2096."""
+"""Receivers count from their own epoch until they know the time; no log is from before 2004 or after 2096."""
 
 
 _RECEIVERS = "vehicle_gps_position sensor_gps GPS"
@@ -146,7 +146,7 @@ def _find_receiver(log: Autopilot) -> tuple[str, Ints, Columns]:
 
 
 def _find_ellipsoidal(log: Autopilot) -> Floats | None:
-    """Return a receiver's heights above the ellipsoid [m], None where they are not logged: 0 throughout, or a number for unknown."""
+    """Return a receiver's heights above the ellipsoid [m]; None if not logged: all 0, or a number for unknown."""
     name, time_us, fields = _find_receiver(log)
     known = {**fields, **_find_accuracy(log, name, time_us)}
     scales = {"altitude_ellipsoid_m": 1.0, "alt_ellipsoid": 1e-3, "AEl": 1.0}

@@ -1,13 +1,14 @@
 """Clocks: which stamp of a message rules, where the clock steps, and what order the messages were measured in.
 
-Every message has a log time (when the recorder received it); most have a header stamp (when it was measured). The header's rules where it
-is set and follows the log time, within 10 s, up to a constant offset; otherwise log time; topic by topic. A *lasting* step (> 0.5 s) of
-header minus log time opens a new clock epoch, common to all topics. Lasting means 10 s, or to the log's end: delays, bursts and single
-wrong stamps are no steps. So does a host's clock that is set back: log times and headers pass a time twice, which is left out.
+Every message has a log time (when the recorder received it); most have a header stamp (when it was measured). The
+header's rules where it is set and follows the log time, within 10 s, up to a constant offset; otherwise log time; topic
+by topic. A *lasting* step (> 0.5 s) of header minus log time opens a new clock epoch, common to all topics. Lasting
+means 10 s, or to the log's end: delays, bursts and single wrong stamps are no steps. So does a host's clock that is set
+back: log times and headers pass a time twice, which is left out.
 
-A simulation runs slower than the wall clock, or faster, and may pause; ROS publishes its time on /clock, and stamps of before September
-2001 are no wall clock's. Where most topics count such a time, and it runs forward, it rules, and no epoch is opened: topics without a
-usable header get the simulation's time by their log time.
+A simulation runs slower than the wall clock, or faster, and may pause; ROS publishes its time on /clock, and stamps of
+before September 2001 are no wall clock's. Where most topics count such a time, and it runs forward, it rules, and no
+epoch is opened: topics without a usable header get the simulation's time by their log time.
 """
 
 from __future__ import annotations
@@ -64,7 +65,8 @@ LOG_CLOCK = Subject("log", "clock")
 class TopicTimes:
     """A topic's times in log-time order: log time and header stamp [ns], shape (N,), the header's 0 where unset.
 
-    ``content``, columns of shape (N,), distinguishes duplicates from repeated stamps; ``prefer`` and ``offset_ns`` are the recipe's.
+    ``content``, columns of shape (N,), distinguishes duplicates from repeated stamps; ``prefer`` and ``offset_ns`` are
+    the recipe's.
     """
 
     log_time_ns: Ints
@@ -78,9 +80,9 @@ class TopicTimes:
 class TopicTimeline:
     """A topic's rows in the order they were measured.
 
-    ``row`` points into the topic's rows; (``epoch``, ``stamp_ns``) increases strictly. ``why`` is a reason in kebab case.
-    ``offset_s`` is the median of header minus log time (None without headers), ``moved_s`` what was added to bring the topic to the clock
-    of the others, by epoch.
+    ``row`` points into the topic's rows; (``epoch``, ``stamp_ns``) increases strictly. ``why`` is a reason in kebab
+    case. ``offset_s`` is the median of header minus log time (None without headers), ``moved_s`` what was added to
+    bring the topic to the clock of the others, by epoch.
     """
 
     row: Ints
@@ -96,14 +98,14 @@ class TopicTimeline:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedClock:
-    """Log times and simulation times of messages [ns], shape (N,), both rising, and the topics that count the simulation time."""
+    """Log times and simulation times of messages [ns], shape (N,), both rising, and the topics with simulation time."""
 
     log_time_ns: Ints
     clock_ns: Ints
     topics: frozenset[str]
 
     def at(self, log_time_ns: Ints) -> Ints:
-        """Return the simulation's time [ns] at each log time; before the first and after the last at the wall clock's rate."""
+        """Return the simulation's time [ns] at each log time; outside its range at the rate of the wall clock."""
         log, clock = self.log_time_ns, self.clock_ns
         found = clock[0] + np.rint(np.interp(log_time_ns - log[0], log - log[0], clock - clock[0])).astype(np.int64)
         outside = np.minimum(log_time_ns - log[0], 0) + np.maximum(log_time_ns - log[-1], 0)
@@ -115,7 +117,7 @@ class SimulatedClock:
         return float(self.clock_ns[-1] - self.clock_ns[0]) / float(self.log_time_ns[-1] - self.log_time_ns[0])
 
     def find_simulated_time(self) -> tuple[Finding, ...]:
-        """Return the finding that durations are those of the simulation; none where the log's own clock is the simulation's."""
+        """Return the finding that durations are those of the simulation; none if the log's own clock is, too."""
         least = read_threshold("simulated-time", "min_rate_difference_fraction")
         if abs(self.rate - 1.0) < least and self.log_time_ns[0] < SIMULATED_NS:
             return ()
@@ -125,7 +127,7 @@ class SimulatedClock:
 
 @dataclass(frozen=True, slots=True)
 class AlignedClocks:
-    """Each topic's timeline, the clock steps that divide them into epochs, and the simulation's clock where that rules."""
+    """Timelines of topics, the clock steps that divide them into epochs, and the simulation's clock if it is used."""
 
     timelines: dict[str, TopicTimeline]
     steps: list[ClockStep]
@@ -151,7 +153,7 @@ def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = F
 
 
 def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int, int, float]]:
-    """Return where most regular topics have twice their messages, since a host's clock was set back: log times [ns], and by how much [s].
+    """Return log times [ns] and sizes [s] of backward steps of a host's clock, where most topics double their messages.
 
     A log is in order of log time: messages of before and after lie between each other there.
     """
@@ -244,7 +246,7 @@ def _settle_steps(topics: Mapping[str, TopicTimes], of_host: Sequence[ClockStep]
 
 
 def _make_simulated_timeline(name: str, times: TopicTimes, clock: SimulatedClock) -> TopicTimeline:
-    """Return the timeline of a topic in a simulation: by its header, or by the simulation's time when it was received."""
+    """Return the timeline of a topic in a simulation: by its header, or the simulation's time of reception."""
     known, epoch = _is_set(times), np.zeros(len(times.log_time_ns), np.int64)
     median, every = _compute_median_offset(times, known), np.ones(len(epoch), bool)
     if times.prefer == "header" and times.header_ns is not None:
@@ -525,8 +527,8 @@ def _find_repeats(stamp_ns: Ints, epoch: Ints) -> Mask:
 def find_simulated_clock(stamps: Mapping[str, tuple[Ints, Ints]], *, published: bool) -> SimulatedClock | None:
     """Return the clock of the simulation that a log is of, None where it is of none.
 
-    ``stamps`` are by topic log times and header stamps [ns], shape (N,), 0 where unset; without a ``published`` /clock they must be no
-    wall clock's.
+    ``stamps`` are by topic log times and header stamps [ns], shape (N,), 0 where unset; without a ``published`` /clock
+    they must be no wall clock's.
     """
     used = {name: (log[header > 0], header[header > 0]) for name, (log, header) in stamps.items() if _is_timed(header)}
     counting = [name for name, (_, header) in used.items() if _is_counting_clock(header, published=published)]

@@ -1,4 +1,4 @@
-"""Expressions of columns in a recipe, as ``(velL + velR) / 2`` or ``pvt.lat * 1e-7``, and the unit that a column's name states."""
+"""Expressions of columns in a recipe, as ``(velL + velR) / 2`` or ``pvt.lat * 1e-7``, and units in column names."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _FOREIGN = re.compile(rf"(?<![^\W_])(?:{'|'.join(sorted(_ENGLISH, key=len, rever
 
 
 def translate(name: str) -> str:
-    """Return a column's name without accents and with the words of the table above in English; other words stay as they are."""
+    """Return a column's name without accents, with the words of the table above in English; other words are kept."""
     signs = unicodedata.normalize("NFKD", name.replace("µ", "u"))
     plain = "".join(sign for sign in signs if not unicodedata.combining(sign))
     return _FOREIGN.sub(lambda found: _ENGLISH[found[0].lower()], plain)
@@ -112,7 +112,7 @@ class Expression:
 
 
 def parse_expression(text: str, known: Collection[str] = ()) -> Expression:
-    """Return the expression of a text; one that is a ``known`` column's name is that column. `ExpressionError`: another text."""
+    """Return the expression of a text; the name of a ``known`` column is that column. `ExpressionError`: other text."""
     quoted = (text,) if text in known else tuple(_QUOTED.findall(text))
     marks = (f"{_MARK}{number}" for number in range(len(quoted)))
     source = next(marks) if text in known else _QUOTED.sub(lambda _: next(marks), text.strip())
@@ -154,14 +154,15 @@ _SUFFIX = re.compile(
 
 
 def simplify_name(name: str) -> str:
-    """Return a column's name in English and lower case, without its unit, ``_`` for blanks and hyphens, to recognise it by."""
+    """Return a column's name in English lower case, without its unit, ``_`` for blanks and hyphens, for recognition."""
     return re.sub(r"[\s-]+", "_", translate(split_unit(name)[0]).strip().lower())
 
 
 def split_unit(name: str) -> tuple[str, str | None, bool]:
     """Return a column's name without the unit at its end, that unit, and whether it is in brackets.
 
-    ``lat (deg)``, ``Power [w]`` and ``speed_kmh`` state one. A text in brackets that is no known unit is returned as it is.
+    ``lat (deg)``, ``Power [w]`` and ``speed_kmh`` state one. A text in brackets that is no known unit is returned as it
+    is.
     """
     opening = max(name.rfind("("), name.rfind("["))
     if opening > 0 and name.rstrip().endswith((")", "]")):

@@ -1,7 +1,8 @@
 """Where sensors sit: chains of static transforms from a sensor's frame to base_link.
 
 Conventions: REP-105 (base_link; base_footprint is its projection on the ground), tf2_msgs/TFMessage (``transform`` is
-parent_from_child). A transform counts as static when all its messages agree, so that a latched /tf of ROS 1 serves as well.
+parent_from_child). A transform counts as static when all its messages agree, so that a latched /tf of ROS 1 serves as
+well.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ IDENTITY = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
 @dataclass(frozen=True, slots=True)
 class Transforms:
-    """Transforms as logged, shape (N,): parent and child frame, position (N, 3) [m], rotation child to parent (N, 4)."""
+    """Transforms as logged, (N,): parent and child frame, position (N, 3) [m], rotation child to parent (N, 4)."""
 
     parent: Sequence[str]
     child: Sequence[str]
@@ -85,8 +86,8 @@ def is_base(frame: str) -> bool:
 def find_base_link_from(frame: str, tree: Tree) -> Pose | None:
     """Return base_link_from_frame by the shortest chain of static transforms, or None where no chain leads to a base.
 
-    base_link goes before base_footprint, and a base with the frame's own prefix before another's; base_footprint stands for base_link
-    only where no base_link is connected.
+    base_link goes before base_footprint, and a base with the frame's own prefix before another's; base_footprint stands
+    for base_link only where no base_link is connected.
     """
     start = frame.strip("/")
     from_start: dict[str, Pose] = {start: IDENTITY}

@@ -1,7 +1,7 @@
 """Mapping of columns and of fields of custom message types to the fields of the message that a role usually has.
 
-One mapping serves tables (`[tables.<role>]`) and custom messages (`[read.fields]`): the fields by their short names, each in its unit.
-Names of columns and fields propose the mapping.
+One mapping serves tables (`[tables.<role>]`) and custom messages (`[read.fields]`): the fields by their short names,
+each in its unit. Names of columns and fields propose the mapping.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Columns = Mapping[str, Array]
 
 @dataclass(frozen=True, slots=True)
 class MappedField:
-    """A field of the message that a role usually has: its dotted name and unit; ``std_of`` is the row of a covariance whose root it is."""
+    """A field of a role's usual message: its dotted name and unit; ``std_of`` is its row of a covariance if it is σ."""
 
     message: str
     unit: str
@@ -168,9 +168,9 @@ def read_fields(
 ) -> dict[str, FieldSource] | list[str]:
     """Return by field what the recipe makes it of, or every problem.
 
-    ``known`` are the columns that there are. The unit of a column alone is what its name ends with, where ``units`` states none;
-    that of an expression has to be stated where its columns have another one than the field. Where a recipe cannot state units (None),
-    an expression converts.
+    ``known`` are the columns that there are. The unit of a column alone is what its name ends with, where ``units``
+    states none; that of an expression has to be stated where its columns have another one than the field. Where a
+    recipe cannot state units (None), an expression converts.
     """
     found: dict[str, FieldSource] = {}
     problems: list[str] = []
@@ -203,7 +203,7 @@ def read_fields(
 
 
 def find_other_unit(expression: Expression, unit: str) -> str | None:
-    """Return the unit that an expression's columns state, if it is not the field's own but of its quantity (for rad/s also a speed's)."""
+    """Return the unit in an expression's column names if it differs from the field's but has its quantity, or None."""
     others = UNITS[unit] | (UNITS["m/s"] if unit == "rad/s" else {})
     named = [split_unit(column)[1] for column, _ in expression.operands()]
     return next((stated for stated in named if stated and others.get(stated, 1.0) != 1.0), None)
@@ -235,8 +235,8 @@ _CLEARLY_A_UNIT = 2
 def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, Array]:
     """Return the fields of the message that a role usually has, by dotted name, from those that are mapped.
 
-    What is not mapped is what the message has for unknown: no orientation, no covariance, no altitude (NaN), a fix, zero elsewhere.
-    ``values`` are by short name, in the units of `MAPPED`, shape (rows,).
+    What is not mapped is what the message has for unknown: no orientation, no covariance, no altitude (NaN), a fix,
+    zero elsewhere. ``values`` are by short name, in the units of `MAPPED`, shape (rows,).
     """
     zero = np.zeros(rows)
     made: dict[str, Array] = {}
@@ -273,7 +273,7 @@ def _collect_other_fields(role: str, values: Mapping[str, Floats], made: Columns
 
 
 def find_topic(name: str, role: str, columns: Collection[str], power_type: str | None) -> tuple[str, str]:
-    """Return the topic and message type as which a table is read: a voltage or a current alone is a bare number, identified by its name.
+    """Return topic and message type of a table; a voltage or a current alone is a bare number, known by its name.
 
     ``power_type`` is that of a source that the recipe makes of the table.
     """
@@ -311,7 +311,7 @@ def utc_from_gps_ns(stamp_ns: Ints) -> Ints:
 
 
 def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, Array] | list[str]:
-    """Return a custom message's columns as those of the message that a role usually has, or what is wrong with the mapping.
+    """Return a custom message's columns as those of the role's usual message, or the problems of the mapping.
 
     ``fields`` are by short name what each is taken from: ``pvt.lat``, ``accel[0]``, ``lat * 1e-7``.
     """

@@ -1,7 +1,8 @@
-"""Quality of fixes: what the codes and words of receivers mean, and the standard deviations that the recipe gives each quality.
+"""Quality of fixes: the codes and words of receivers, and the standard deviations that the recipe gives each quality.
 
-Sources of the codes: NMEA 0183 (GGA, field 6), RTKLIB manual 2.4.2 (Q of solution files), u-blox F9 interface description (carrSoln),
-MAVLink (GPS_FIX_TYPE), sensor_msgs/NavSatStatus, gps_common/GPSStatus. A ground-based augmentation (2) is RTK, fixed or float.
+Sources of the codes: NMEA 0183 (GGA, field 6), RTKLIB manual 2.4.2 (Q of solution files), u-blox F9 interface
+description (carrSoln), MAVLink (GPS_FIX_TYPE), sensor_msgs/NavSatStatus, gps_common/GPSStatus. A ground-based
+augmentation (2) is RTK, fixed or float.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ _EQUAL_FEWEST = 20
 
 
 def split_codes(text: str) -> tuple[str | None, str]:
-    """Return what the codes of a column are and the column, of ``gga: quality``, or of a name that says so: ``carrSoln``."""
+    """Return the kind of codes and the column of ``gga: quality``, or of a name that shows the kind: ``carrSoln``."""
     codes, colon, column = text.partition(":")
     if colon and codes.strip() in CODES:
         return codes.strip(), column.strip()
@@ -63,7 +64,7 @@ def split_codes(text: str) -> tuple[str | None, str]:
 
 
 def find_quality(names: Iterable[str]) -> list[str]:
-    """Return the first name that may be a fix quality, with the codes that are likeliest: ``gga: quality``; [] where none is."""
+    """Return the first name that may be a fix quality, with the likeliest codes: ``gga: quality``; [] without one."""
     likely = {"gga": r"(.*[_.])?(qual(ity)?|mode|fix_?(type|mode)?)", "navsat": r"(.*[_.])?status"}
     found = [
         f"{codes}: {name}"
@@ -88,7 +89,7 @@ def classify_fixes(values: Array, codes: str) -> Floats:
 
 
 def classify_status(status: Ints, codes: str) -> Floats:
-    """Return the quality of each fix by the status of its message; one that is always 0 says nothing, as many drivers set no other."""
+    """Return the quality of each fix by its status; a status that is always 0 is ignored, as drivers set no other."""
     return classify_fixes(status, codes) if np.any(status > 0) else np.full(len(status), _UNKNOWN)
 
 
@@ -98,7 +99,7 @@ def find_status(quality: Floats) -> NDArray[np.int8]:
 
 
 def convert_gps_fix(columns: Columns) -> dict[str, Array]:
-    """Return the fields of gps_common/GPSFix as those of NavSatFix; its errors, at 95 per cent, where it has no covariance."""
+    """Return the fields of gps_common/GPSFix as those of NavSatFix; without a covariance by its errors of 95 %."""
     quality = classify_status(columns["status.status"].astype(np.int64), "gps_common")
     made = {**columns, "fix_quality": quality}
     made["status.status"] = np.where(quality >= 0, find_status(quality), np.clip(columns["status.status"], -1, 2))
@@ -113,7 +114,7 @@ def convert_gps_fix(columns: Columns) -> dict[str, Array]:
 
 
 def add_quality_std(columns: Columns, std_m: Mapping[str, float]) -> tuple[dict[str, Array], int]:
-    """Return fixes with the deviations of their quality where they have none, or one and the same for all, and how many that are.
+    """Return fixes with the σ of their quality if they have none, or one σ for all; and the number of such fixes.
 
     ``std_m`` [m] goes before `FIX_STD_M`; heights have twice as much.
     """

@@ -1,7 +1,7 @@
-"""Meaning of messages: from a topic's fields to the SI columns of its role, row by row; excluded rows are counted by reason.
+"""Conversion of a topic's fields to the SI columns of its role, row by row; excluded rows are counted by reason.
 
-Columns in, columns out, named as in the levels' tables. Sources: the definitions of sensor_msgs, nav_msgs and geometry_msgs (their
-comments fix units, frames and what -1 and 0 mean), REP-103, REP-105, REP-145.
+Columns in, columns out, named as in the levels' tables. Sources: the definitions of sensor_msgs, nav_msgs and
+geometry_msgs (their comments fix units, frames and what -1 and 0 mean), REP-103, REP-105, REP-145.
 """
 
 from __future__ import annotations
@@ -41,8 +41,9 @@ _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 class Readings:
     """A topic's usable rows.
 
-    ``row`` is each one's place in the table, ``header_ns`` its own stamp (0 where unset, None where the type has none), ``dropped`` counts
-    the rows that are not used by reason, ``notes`` counts values that were set aside inside used rows.
+    ``row`` is each one's place in the table, ``header_ns`` its own stamp (0 where unset, None where the type has none),
+    ``dropped`` counts the rows that are not used by reason, ``notes`` counts values that were set aside inside used
+    rows.
     """
 
     row: Ints
@@ -72,8 +73,9 @@ def read_messages(
 ) -> Readings:
     """Return the readings of a topic that is used as ``role`` (power is read by `tcpipe.power.readings`).
 
-    ``columns`` are ``log_time_ns`` and the message's fields by dotted name, shape (N,); covariances have shape (N, k), frames and
-    sentences are arrays of str. `KeyError`: its type lacks the field that this names. ``fix_std_m`` is the recipe's ``read.fix_std_m``.
+    ``columns`` are ``log_time_ns`` and the message's fields by dotted name, shape (N,); covariances have shape (N, k),
+    frames and sentences are arrays of str. `KeyError`: its type lacks the field that this names. ``fix_std_m`` is the
+    recipe's ``read.fix_std_m``.
     """
     found = _READERS[role, type_name]({name: _mask_impossible(name, values) for name, values in columns.items()})
     if role != "gnss":
@@ -87,7 +89,7 @@ _IMPOSSIBLE = 1e9
 
 
 def _mask_impossible(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """Return the values of a field with NaN for those that no sensor can mean; covariances are judged where they are used."""
+    """Return the values of a field, NaN for those that no sensor can report; covariances are checked when used."""
     if not np.issubdtype(values.dtype, np.floating) or name.endswith("covariance"):
         return values
     possible = np.abs(values) <= _IMPOSSIBLE
@@ -95,7 +97,7 @@ def _mask_impossible(name: str, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def count_frames(columns: Columns, type_name: str) -> dict[str, int]:
-    """Return the frames that a topic's measurements are given in, with their counts, most frequent first; leading slashes stripped.
+    """Return the frames of a topic's measurements with their counts, most frequent first; leading slashes are removed.
 
     A pose names only the frame it is in, not whose pose it is: none.
     """
@@ -151,7 +153,7 @@ def _name_axes(name: str, suffix: str, values: Floats) -> dict[str, NDArray[Any]
 
 
 def _read_variances(columns: Columns, name: str, *diagonal: int) -> Floats:
-    """Return diagonal entries of a covariance, shape (N, k); NaN where they cannot be trusted: zero, negative or not finite."""
+    """Return diagonal entries of a covariance, shape (N, k); NaN for unusable ones: zero, negative or not finite."""
     if name not in columns:
         return np.full((len(columns[LOG_TIME]), len(diagonal)), np.nan)
     chosen = columns[name].astype(np.float64)[:, list(diagonal)]
@@ -159,7 +161,7 @@ def _read_variances(columns: Columns, name: str, *diagonal: int) -> Floats:
 
 
 def _is_absent(columns: Columns, name: str) -> Mask:
-    """Whether a covariance says that its quantity is not measured: -1 in its first element (sensor_msgs/Imu), or all of it vast."""
+    """Whether a covariance marks its quantity as not measured: first element -1 (sensor_msgs/Imu), or all vast."""
     if name not in columns:
         return np.zeros(len(columns[LOG_TIME]), bool)
     return np.asarray((columns[name][:, 0] == -1) | (columns[name][:, [0, 4, 8]] >= _UNMEASURED_VAR).all(1))
@@ -170,7 +172,7 @@ _UNMEASURED_VAR = 1e3
 
 
 def _find_unmeasured(columns: Columns, name: str, twist: Floats) -> Mask:
-    """Return which components of a twist (N, 6) are no measurements: variance -1 or vast, or zero throughout while the robot moves.
+    """Return components of a twist (N, 6) that are not measured: variance -1 or very large, or all zero in motion.
 
     Forward velocity keeps its variance. The last digit distinguishes a constant from a calm sensor, only in some rows.
     """
@@ -239,7 +241,8 @@ def _read_nav_sat_fix(columns: Columns) -> Readings:
 def _read_altitude(alt: Floats, fixed: Mask) -> tuple[Floats, Mask]:
     """Return heights, the median of the known ones where a height is missing, and the rows of these.
 
-    NaN is sensor_msgs/NavSatFix's word for it; a receiver's own digits never stand still, so one constant is a word for it too.
+    NaN is sensor_msgs/NavSatFix's word for it; a receiver's own digits never stand still, so one constant is a word for
+    it too.
     """
     unknown = ~np.isfinite(alt)
     known = alt[~unknown & fixed]
@@ -282,7 +285,7 @@ def _read_nmea(columns: Columns) -> Readings:
 
 
 def find_utc_offset(readings: Readings) -> tuple[Finding, ...]:
-    """Return the finding that the UTC of a receiver's sentences, which is used, is further from their headers than a serial port takes."""
+    """Return the finding that the used UTC of a receiver's sentences is further from their headers than a transfer."""
     own_time_ns, stamps_ns = readings.own_time_ns, readings.header_ns
     if own_time_ns is None or stamps_ns is None or not (known := (own_time_ns > 0) & (stamps_ns > 0)).any():
         return ()
@@ -306,12 +309,12 @@ def _make_ground_velocity(
 
 
 _HELD_COURSE_MPS = 0.3
-"""Speed [m/s] below which a receiver repeats its last course or invents one: the velocity is anywhere on a circle of that radius."""
+"""Speed [m/s] below which a receiver repeats or invents a course: the velocity is somewhere on that circle."""
 _SLOW_STD_MPS = 0.1
 
 
 def _compute_course_velocity(speed: Floats, course_rad: Floats, var: Floats) -> tuple[Floats, Floats]:
-    """Return velocities east and north (N, 2) from speed [m/s] and course (clockwise from north), and their variances, (N, 2)."""
+    """Return velocities east, north (N, 2) from speed [m/s] and course (clockwise from north); variances (N, 2)."""
     slow = speed < _HELD_COURSE_MPS
     velocity = speed[:, None] * np.column_stack((np.sin(course_rad), np.cos(course_rad)))
     circle = speed**2 / 2 + np.where(np.isfinite(var), var, _SLOW_STD_MPS**2)
@@ -381,7 +384,7 @@ _STDS_OF_95 = 2.0
 
 
 def _read_velocity_twist(columns: Columns) -> Readings:
-    """Return the linear part as east, north, up, as the drivers of receivers write it; one that has no north is of the body."""
+    """Return the linear part as east, north, up, as receivers' drivers write it; without north it is of the body."""
     with_covariance = "twist.twist.linear.x" in columns
     prefix = "twist.twist" if with_covariance else "twist"
     velocity = _read_vector(columns, f"{prefix}.linear")
@@ -529,7 +532,7 @@ _READERS: dict[tuple[str, str], Callable[[Columns], Readings]] = {
 
 
 def select_ground_velocity(readings: Readings, frame: str, topic: str) -> Readings:
-    """Return a receiver's velocities, none with a finding where their frame is the body's: whose axes they have is not known."""
+    """Return a receiver's velocities; none, with a finding, if their frame is the body's, whose axes are unknown."""
     if not is_base(frame):
         return readings
     remedies = suggest("use", {"read.topics": {"gnss_velocity": [topic]}})

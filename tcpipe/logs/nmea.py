@@ -1,10 +1,11 @@
 """NMEA 0183: GGA, a GNSS position without a date and above the geoid; RMC and VTG, speed and course over ground.
 
-Layout: ``$ttGGA,hhmmss.ss,ddmm.mm,N|S,dddmm.mm,E|W,quality,satellites,hdop,altitude,M,separation,M,age,station*checksum``;
-the checksum is the exclusive or of all bytes between ``$`` and ``*``. Height above the ellipsoid = altitude + separation.
-``$ttRMC,hhmmss.ss,A|V,ddmm.mm,N|S,dddmm.mm,E|W,speed [knots],course [deg],ddmmyy,variation,E|W,mode``;
-``$ttVTG,course [deg true],T,course [deg magnetic],M,speed [knots],N,speed [km/h],K,mode``; the mode is missing before v2.3.
-Source: NMEA 0183 v4.11, sentences GGA, RMC, VTG.
+Layout:
+``$ttGGA,hhmmss.ss,ddmm.mm,N|S,dddmm.mm,E|W,quality,satellites,hdop,altitude,M,separation,M,age,station*checksum``; the
+checksum is the exclusive or of all bytes between ``$`` and ``*``. Height above the ellipsoid = altitude + separation.
+``$ttRMC,hhmmss.ss,A|V,ddmm.mm,N|S,dddmm.mm,E|W,speed [knots],course [deg],ddmmyy,variation,E|W,mode``; ``$ttVTG,course
+[deg true],T,course [deg magnetic],M,speed [knots],N,speed [km/h],K,mode``; the mode is missing before v2.3. Source:
+NMEA 0183 v4.11, sentences GGA, RMC, VTG.
 """
 
 from __future__ import annotations
@@ -31,9 +32,10 @@ _TIME = re.compile(r"(\d{2})(\d{2})(\d{2})(?:\.(\d{1,9}))?\Z")
 
 @dataclass(frozen=True, slots=True)
 class Gga:
-    """Sentences that are GGA, shape (N,): where they stood in the input, and what they say; NaN and -1 where a field is empty.
+    """GGA sentences, shape (N,): their rows in the input, and their values; NaN and -1 for empty fields.
 
-    ``time_of_day_ns`` is UTC since midnight, ``alt_m`` above the geoid; ``broken`` marks a wrong checksum or an unreadable field.
+    ``time_of_day_ns`` is UTC since midnight, ``alt_m`` above the geoid; ``broken`` marks a wrong checksum or an
+    unreadable field.
     """
 
     row: Ints
@@ -51,8 +53,8 @@ class Gga:
 class OverGround:
     """Sentences with speed and course, as `Gga`.
 
-    ``time_of_day_ns`` is -1 without a time (VTG); ``course_rad`` clockwise from true north; ``status`` is -1 if the receiver marks the
-    sentence as not valid.
+    ``time_of_day_ns`` is -1 without a time (VTG); ``course_rad`` clockwise from true north; ``status`` is -1 if the
+    receiver marks the sentence as not valid.
     """
 
     row: Ints
@@ -80,7 +82,7 @@ def read_over_ground(sentences: Sequence[str]) -> OverGround:
 def _read(
     sentences: Sequence[str], kind: str, parse: Callable[[list[str]], tuple[float, ...]], width: int
 ) -> tuple[Ints, Mask, Floats]:
-    """Return where sentences of a kind stand, which are broken, and what ``parse`` makes of their fields, shape (width, N)."""
+    """Return the places of sentences of a kind, which are damaged, and ``parse`` of their fields, shape (width, N)."""
     found = [(row, match) for row, text in enumerate(sentences) if (match := _SENTENCES[kind].search(text)) is not None]
     values = np.full((len(found), width), np.nan)
     broken = np.zeros(len(found), np.bool_)
@@ -163,10 +165,10 @@ def _parse_time_of_day_ns(text: str) -> int:
 
 
 def add_date(time_of_day_ns: Ints, log_time_ns: Ints) -> Ints:
-    """Return UTC stamps [ns], shape (N,): on the day that keeps the time nearest to the log's clock; 0 where it is negative (unknown).
+    """Return UTC stamps [ns], shape (N,), on the day nearest to the log's clock; 0 for a negative (unknown) time.
 
-    A constant offset between both clocks, even one near half a day, keeps one sign throughout: the first row decides, and later rows stay
-    within half a day of its offset.
+    A constant offset between both clocks, even one near half a day, keeps one sign throughout: the first row decides,
+    and later rows stay within half a day of its offset.
     """
     known = time_of_day_ns >= 0
     stamps = np.zeros(len(time_of_day_ns), np.int64)

@@ -1,4 +1,4 @@
-"""Which fields of a message, or columns of a table, are voltage, current and power of what drives, by what they are called."""
+"""Find voltage, current and power of the drive among fields of a message, or columns of a table, by their names."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _PHASE = re.compile(r"phase|motors?|q|d|rms")
 
 @dataclass(frozen=True, slots=True)
 class PowerFields:
-    """Fields read together: those of each rail by quantity, with the factor that the unit in its name states, and what is unclear."""
+    """Fields read together: those of each rail by quantity, with the factor of the unit in the name, and doubts."""
 
     rails: tuple[Mapping[str, str], ...]
     scales: Mapping[str, float]
@@ -67,7 +67,8 @@ def split_sides(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def match_power_fields(names: Iterable[str]) -> PowerFields | None:
     """Return the voltage and current, or the power, among fields; None where neither a current nor a power is.
 
-    Fields whose names differ by sides or numbers alone belong together: each at its own voltage where there are as many, else added.
+    Fields whose names differ by sides or numbers alone belong together: each at its own voltage where there are as
+    many, else added.
     """
     named = [found for name in names if (found := _read_name(name))]
     watt, amp, volt = ([field for field in named if field.quantity == what] for what in ("power", "current", "voltage"))
@@ -90,7 +91,7 @@ def match_power_fields(names: Iterable[str]) -> PowerFields | None:
 
 
 def match_sided_velocities(names: Iterable[str]) -> dict[str, str]:
-    """Return the forward velocity as the mean of those of both sides, and the turn rate for a track of 0.5 m; {} without.
+    """Return the forward velocity as the mean of both sides, and the turn rate for a track of 0.5 m; {} without sides.
 
     Turn rates of wheels are velocities of a wheel with a radius of 0.1 m, and give no turn rate.
     """
@@ -151,7 +152,7 @@ def _choose(named: Sequence[_Named]) -> tuple[list[_Named], list[_Named]]:
 
 
 def _rank(group: Sequence[_Named]) -> tuple[bool, bool, bool]:
-    """Return whether the fields are not named like the supply, whether like a motor, and whether like one of several controllers.
+    """Return whether fields' names are not a supply's, are a motor's, and are one of several controllers'.
 
     VESC Tool's ``setup`` is the sum over all controllers.
     """

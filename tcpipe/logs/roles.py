@@ -1,8 +1,8 @@
-"""Assignment of topics to roles from the topic list alone, with the reason; tcpipe asks for a decision with the line of the recipe.
+"""Assignment of topics to roles by the topic list, with the reason; ambiguous ones need a line of the recipe.
 
-Rules, in this order: the recipe; outputs of other estimators are not used (fusing them again would count a sensor twice); the message
-type; the name of the topic, unless the topic covers only a small part of what another covers; topics that follow each other are joined.
-If several topics remain, tcpipe asks. Roles without a topic and topics that are not used or cannot be decoded are findings.
+Rules, in this order: the recipe; outputs of other estimators are not used (fusing them would count a sensor twice);
+the message type; the topic's name, unless it covers only a small part of what another covers; topics that follow each
+other are joined. If several remain, tcpipe asks. Missing roles, and topics that are not used, are findings.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _MEASURED_TWISTS = (ODOMETRY, TWIST_WITH_COVARIANCE_STAMPED, TWIST_STAMPED)
 
 OVERLAY = "/tcpipe/"
-"""Topics below it are what `tcpipe overlay` made of a log: they play no role, lest a run is made of another's results."""
+"""Prefix of topics that `tcpipe overlay` added to a log: they have no role, so that results are never inputs."""
 
 ROLE_TYPES: dict[str, tuple[str, ...]] = {
     "gnss": (NAV_SAT_FIX, *GPS_FIXES, NMEA_SENTENCE),
@@ -70,7 +70,7 @@ MOTION_ROLES = ("wheel_odometry", "visual_odometry", "gnss", "pose")
 
 @dataclass(frozen=True, slots=True)
 class PlayedRole:
-    """A role, the topics that are used as it (of power a sum, else one after the other), the type of the first, and why."""
+    """A role, its topics (power is their sum, else they are used in turn), the type of the first, and the reason."""
 
     name: str
     topics: tuple[str, ...]
@@ -82,9 +82,9 @@ class PlayedRole:
 class RoleAssignment:
     """Who plays what.
 
-    ``left_out`` says why a topic plays no role though its type could; ``problems`` are the plain lines of what the user has to decide;
-    ``findings`` are the roles that are missing and the topics that are not used; ``transforms`` are the topics that may place
-    sensors, static ones first.
+    ``left_out`` says why a topic plays no role though its type could; ``problems`` are the plain lines of what the user
+    has to decide; ``findings`` are the roles that are missing and the topics that are not used; ``transforms`` are the
+    topics that may place sensors, static ones first.
     """
 
     robot: str
@@ -144,9 +144,9 @@ def assign_roles(
 ) -> RoleAssignment:
     """Return which topic plays which role, and why; `RecipeError`: no profile is called ``robot``.
 
-    ``chosen`` is the recipe's ``read.topics``: of power all are summed; of other roles the first is used, and those named after it while
-    it has no messages; an empty list means that no topic is used. Outside ``namespace`` only topics that are chosen by name are used.
-    Those of the ``mapped`` roles (``read.fields``) may be of any type.
+    ``chosen`` is the recipe's ``read.topics``: of power all are summed; of other roles the first is used, and those
+    named after it while it has no messages; an empty list means that no topic is used. Outside ``namespace`` only
+    topics that are chosen by name are used. Those of the ``mapped`` roles (``read.fields``) may be of any type.
     """
     every = {topic.name: topic for topic in sorted(topics, key=lambda topic: topic.name)}
     named = {name for names in chosen.values() for name in names}
@@ -229,7 +229,7 @@ def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_sources: Co
 
 
 def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> None:
-    """Use the pose of another program if its name identifies it, it is the only one, and no other topic measures positions."""
+    """Use the pose of another program if its name shows it, it is the only one, and nothing else measures positions."""
     best = [] if taken else _select_best("pose", candidates) if candidates else []
     for _, why, topic in candidates:
         if [topic] == [other for _, other in best]:
@@ -463,7 +463,7 @@ def _sort_power(decided: _Decisions, topic: Topic) -> Sorted:
 
 
 def _find_bare_power(decided: _Decisions, topics: Iterable[Topic]) -> Ranked:
-    """Return bare numbers that form power rails: one voltage and one current of drives or batteries whose topics have like names."""
+    """Return bare numbers that form power rails: a voltage and a current of similar names, of drives or batteries."""
     rails: dict[str, list[Topic]] = {}
     for topic in topics:
         if find_quantity(topic.name) is not None and re.search(r"drive|motor|traction|batter", topic.name.lower()):
@@ -532,7 +532,7 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
 
 
 def _select_best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
-    """Return the candidates of the best rank, each with what speaks for it; those that cover little beside another do not count.
+    """Return the best-ranked candidates with their reasons, without those that cover little compared with another.
 
     Of power all of a rank are taken, since sides are summed: one that fell silent is still a side.
     """

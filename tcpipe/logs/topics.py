@@ -1,6 +1,7 @@
 """Topics of a log, as data and in words, and their coverage of a drive; findings on topics and on damage of the log.
 
-The robot of a log is stated by the user, or found by message types that only one robot publishes or by its name in a topic.
+The robot of a log is stated by the user, or found by message types that only one robot publishes or by its name in a
+topic.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ AutopilotKind = Literal["ulog", "dataflash"]
 class Topic:
     """One topic of a log, or of a file of it, by the index; None for values that the index lacks.
 
-    ``type_name`` is ``package/msg/Name`` for ROS 1 and ROS 2 alike; ``encoding`` is ``cdr``, ``ros1``, or what else the log names;
-    ``definition`` is the definition text in the log ("" where it has none), of the language ``schema_encoding``; ``problem`` says why the
-    topic cannot be read.
+    ``type_name`` is ``package/msg/Name`` for ROS 1 and ROS 2 alike; ``encoding`` is ``cdr``, ``ros1``, or what else the
+    log names; ``definition`` is the definition text in the log ("" where it has none), of the language
+    ``schema_encoding``; ``problem`` says why the topic cannot be read.
     """
 
     name: str
@@ -73,8 +74,9 @@ class Topic:
 class Damage:
     """A damaged place of a log, and what it cost where that is known.
 
-    ``cause`` is a code in the catalogue of findings, ``file`` of a directory its name and that of the file, ``offset`` [byte] where in the
-    file, ``places`` how many are counted together, ``reason`` what the template of the cause needs beside numbers.
+    ``cause`` is a code in the catalogue of findings, ``file`` of a directory its name and that of the file, ``offset``
+    [byte] where in the file, ``places`` how many are counted together, ``reason`` what the template of the cause needs
+    beside numbers.
     """
 
     cause: str
@@ -93,7 +95,7 @@ class Damage:
 
 
 def find_damage(damage: Iterable[Damage]) -> list[Finding]:
-    """Return a finding for each cause and file or topic: counts add up, the first reason counts, and without a loss it is a note."""
+    """Return one finding per cause and file or topic, with summed counts; without a loss it is a note."""
     groups: dict[tuple[str, Subject], list[Damage]] = {}
     for place in dict.fromkeys(damage):
         subject = Subject("topic", place.topic) if place.topic else Subject("file", place.file)
@@ -142,7 +144,7 @@ LISTED = 8
 
 
 def format_topics(topics: Iterable[Topic], types: Sequence[str] | None = None) -> str:
-    """Return topics as ``/name (type, n messages, rate)``, the longest lists cut; those of ``types`` only, where there are any."""
+    """Return topics as ``/name (type, n messages, rate)``, shortened if long; only those of ``types`` if any."""
     every = list(topics)
     of_type = [topic for topic in every if types is not None and topic.type_name in types]
     chosen = of_type or every
@@ -183,11 +185,11 @@ _LITTLE_SPAN_OF_POWER = 0.1
 """For power the coverage counts less, since topics measure propulsion or the whole battery: different quantities."""
 _SILENCE_NS, _SILENT_PERIODS = 5_000_000_000, 10
 _LITTLE_COUNT = 0.01
-"""Sensors that could play one role differ in rate, but not a hundredfold: 1 Hz of GNSS against 20 Hz, 10 Hz of odometry against 200 Hz."""
+"""Largest ratio of rates of sensors for one role [1]: GNSS has 1 Hz to 20 Hz, odometry 10 Hz to 200 Hz."""
 
 
 def find_short_topics(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_power: bool = False) -> frozenset[str]:
-    """Return which topics, by name, cover less than such a share of what a rival covers, or hold less than a hundredth of its messages.
+    """Return topics by name that cover less than this share of a rival, or have less than a hundredth of its messages.
 
     A topic is not short if the index lacks its times or counts.
     """
@@ -218,7 +220,7 @@ def _ends_before(one: Topic, other: Topic) -> bool:
 
 
 def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:
-    """Return how long a topic was silent [ns], by the spans (first, last time) of those pieces of a log that hold messages of it.
+    """Return the silence of a topic [ns], by the spans (first, last time) of the parts of a log with its messages.
 
     Only gaps above 5 s and ten mean periods count.
     """
@@ -260,7 +262,7 @@ def find_left_out(reasons: Mapping[tuple[str, str], str]) -> Iterator[Finding]:
 
 
 def find_undecodable(topics: Iterable[Topic], types: Collection[str]) -> Iterator[Finding]:
-    """Yield a finding for each topic that holds data that cannot be decoded: a warning where its type can be used as a role."""
+    """Yield a finding for each topic that cannot be decoded: a warning if its type can have a role."""
     for topic in topics:
         if topic.problem is not None and topic.message_count != 0:
             yield make_topic_not_decoded(topic, severity="warning" if topic.type_name in types else "note")
@@ -279,7 +281,7 @@ _SERIAL_NUMBER = re.compile(r"(?<![a-z0-9])([a-z]{1,2}\d{3})[_-]\d{4}(?!\d)")
 
 
 def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, Robot]) -> tuple[str, str]:
-    """Return the profile of a log, ``name`` where the user gave one, and why; `RecipeError` where no profile has that name."""
+    """Return the profile of a log, ``name`` if the user gave one, and the reason; `RecipeError` for an unknown name."""
     if name is not None:
         if name not in robots:
             raise RecipeError(f"robot: no profile {name!r}; known: {', '.join(sorted(robots))}")
@@ -318,8 +320,9 @@ _PLACES = frozenset({"gnss", "wheel_odometry"})
 def find_robot_namespaces(candidates: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
     """Return the roles that could be played in each robot's namespace, or nothing where one robot explains the topics.
 
-    Two namespaces are two robots when three roles or more, GNSS or wheels among them, could be played in either. A camera that brings an
-    IMU and an odometry of its own, or a controller that takes commands and gives odometry, is no robot.
+    Two namespaces are two robots when three roles or more, GNSS or wheels among them, could be played in either. A
+    camera that brings an IMU and an odometry of its own, or a controller that takes commands and gives odometry, is no
+    robot.
     """
     roles_of: dict[str, set[str]] = {}
     for role, topics in candidates.items():

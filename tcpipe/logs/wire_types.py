@@ -1,9 +1,10 @@
-"""Layout of messages by their definition: scalars, texts, arrays and records as one small tree, and parsing of the text of a definition.
+"""Layout of messages by their definition, as a tree of scalars, texts, arrays and records; parser of definitions.
 
 Both ROS 1 serialisation and CDR write these types field after field.
 
-A .msg definition (http://wiki.ros.org/msg, and ROS 2's bounds and defaults) in a log holds the message first, then every message it is
-made of, each below a line of ``=`` and ``MSG: package/Name``. Constants, defaults and comments do not matter for reading.
+A .msg definition (http://wiki.ros.org/msg, and ROS 2's bounds and defaults) in a log holds the message first, then
+every message it is made of, each below a line of ``=`` and ``MSG: package/Name``. Constants, defaults and comments do
+not matter for reading.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from tcpipe.arrays import Bytes, Ints, Mask
 from tcpipe.logs.topics import normalize_type_name
 
 MAX_COLUMNS = 20_000
-"""A definition that unfolds to more leaves than this is refused (nested arrays of nested records grow exponentially)."""
+"""Most leaves of an unfolded definition [1]; a larger one is refused (nested arrays grow exponentially)."""
 MAX_FIXED_ELEMENTS = 100_000
 """A definition whose fixed arrays hold more texts or messages than this is refused."""
 
@@ -149,8 +150,8 @@ class MsgTextError(ValueError):
 class FieldType:
     """A field's type: a base type, or the full name of a message.
 
-    ``text_limit`` is the most characters of a text (0: any number); ``length`` is None for one value, else the number of elements:
-    exactly so many where ``fixed``, at most so many otherwise (0: any number).
+    ``text_limit`` is the most characters of a text (0: any number); ``length`` is None for one value, else the number
+    of elements: exactly so many where ``fixed``, at most so many otherwise (0: any number).
     """
 
     name: str
@@ -163,7 +164,7 @@ FieldTypes = tuple[tuple[str, FieldType], ...]
 
 
 def parse_msg(text: str, type_name: str) -> dict[str, FieldTypes]:
-    """Return the fields of each message in a definition of ``type_name``, by full name; `MsgTextError` where a line is no field."""
+    """Return the fields of each message in a definition by full name; `MsgTextError` if a line is no field."""
     pieces = _SECTION.split(text.replace("\r\n", "\n") + "\n")
     names = [type_name, *map(normalize_type_name, pieces[1::2])]
     return {
@@ -222,8 +223,9 @@ class RaggedError(ValueError):
 class Dialect:
     """How messages are serialised.
 
-    Fields begin ``origin`` bytes into a message, are aligned from there to at most ``max_alignment``; texts end in ``terminator`` bytes
-    that are no text; a message without fields takes ``empty_record_bytes``; up to ``padding`` bytes may follow the last field.
+    Fields begin ``origin`` bytes into a message, are aligned from there to at most ``max_alignment``; texts end in
+    ``terminator`` bytes that are no text; a message without fields takes ``empty_record_bytes``; up to ``padding``
+    bytes may follow the last field.
     """
 
     byte_order: str
@@ -261,7 +263,7 @@ class Grid:
     strides: tuple[int, ...]
 
     def view(self, data: Bytes, dtype: np.dtype[np.generic], count: int = 1) -> NDArray[np.generic]:
-        """Return a copy of the values there, ``count`` of them side by side at each place, in the order of `list_offsets`."""
+        """Return a copy of the values there, ``count`` side by side at each place, in the order of `list_offsets`."""
         together = dtype if count == 1 else np.dtype(f"V{count * dtype.itemsize}")  # many at once are copied faster
         if not count:
             return np.zeros(0, dtype)
@@ -325,7 +327,7 @@ class WalkResult:
 
 
 def walk(message: Record, data: Bytes, starts: Ints, ends: Ints, dialect: Dialect) -> WalkResult:
-    """Find every field of every message; `RaggedError` where they are so unlike that they are cheaper to read one by one.
+    """Find every field of every message; `RaggedError` if they differ so much that one by one is cheaper.
 
     Each begins and ends in ``data`` at ``starts`` and ``ends``, shape (N,), rising.
     """
@@ -353,9 +355,10 @@ def _find_grid(bases: Ints, sizes: Ints) -> Places:
 
 
 class _Cursors:
-    """A position in each message, counted from where its fields begin; a message that does not fit is marked, and stands still.
+    """A position in each message, from the begin of its fields; a message that does not fit is marked and skipped.
 
-    While ``_bases`` is a grid, messages have one size, ``_at`` is the position in all of them, and one that does not fit is an error.
+    While ``_bases`` is a grid, messages have one size, ``_at`` is the position in all of them, and one that does not
+    fit is an error.
     """
 
     def __init__(self, data: Bytes, bases: Places, sizes: Ints, dialect: Dialect) -> None:
@@ -507,7 +510,7 @@ def _join_values(pieces: Sequence[Values], order: Ints) -> Values:
 
 @cache
 def _find_regular_size(wire_type: WireType, max_alignment: int) -> tuple[int, int, int]:
-    """Return size, distance and alignment of values that follow one another, where these are the same wherever they stand; (0, 0, 1) else.
+    """Return size, distance and alignment of consecutive values if they are the same everywhere; else (0, 0, 1).
 
     They are where the first field has the largest alignment.
     """

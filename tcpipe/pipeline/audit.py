@@ -44,7 +44,7 @@ WINDOWS_S = (10.0, 30.0, 60.0)
 
 @dataclass(frozen=True, slots=True)
 class WithheldComparisons:
-    """Comparisons of a run by length of the windows; why others are missing; without fixes the track's length over each odometry's."""
+    """Comparisons of a run by window length, reasons of missing ones; without fixes track length per odometry's."""
 
     comparisons: tuple[Comparison, ...]
     skipped: tuple[str, ...]
@@ -122,7 +122,7 @@ def _compare_fixes(run: _Run, gnss: Positions, windows_ns: Ints) -> Comparison:
 
 
 def withhold(streams: Streams, epoch: int, windows_ns: Ints) -> Streams:
-    """Return the streams without fixes and velocities of the receiver in windows [ns], shape (N, 2), of a clock epoch."""
+    """Return the streams of a clock epoch without fixes and receiver velocities in windows [ns], shape (N, 2)."""
 
     def keep(table: pa.Table) -> pa.Table:
         stamp_ns = to_integers(table, "stamp_ns")
@@ -210,8 +210,8 @@ def audit(
 ) -> Audit:
     """Withhold fixes in windows, fuse the rest, and score the track by what was withheld.
 
-    Raises `UsageError`: the run is too short, or has no sensor beside the one that would be withheld; `LogError`, `RecipeError`,
-    `StoreError`, `FusionError`: it cannot be read or fused.
+    Raises `UsageError`: the run is too short, or has no sensor beside the one that would be withheld; `LogError`,
+    `RecipeError`, `StoreError`, `FusionError`: it cannot be read or fused.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def read_audited(
     message_definitions: Path | None = None,
     store: Location = "tcpipe-store",
 ) -> tuple[Streams, FuseConfig]:
-    """Return the streams of a log or of a run of a store, and how these are fused; parameters and errors as for `audit`."""
+    """Return the streams of a log or of a stored run, and fusion's settings; parameters and errors as for `audit`."""
     if not is_path(run):
         stored = find_named_run(run, store)
         return stored.streams(), stored.manifest.recipe.fuse

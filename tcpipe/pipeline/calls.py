@@ -1,4 +1,4 @@
-"""Calls on a store: the record of each call, which calls are open or were killed, what calls took, and estimates from that."""
+"""Calls on a store: the record of each call, open and killed calls, durations of calls, and estimates from these."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def identify_process() -> Process:
 
 
 def is_alive(process: Process) -> bool | None:
-    """Return whether a process lives; None where that cannot be seen from here: another machine or container, another system."""
+    """Return whether a process exists; None if it cannot be seen: another machine, container or system."""
     here = identify_process()
     if (process.host, process.machine) != (here.host, here.machine) or not (process.boot and process.start):
         return None
@@ -47,7 +47,7 @@ def is_alive(process: Process) -> bool | None:
 
 
 def _read_start_time(pid: int) -> str:
-    """Return when a living process began, in ticks since the start of the machine (proc(5): stat); "" without such a process."""
+    """Return the start of a process in ticks since boot (proc(5): stat); "" without such a process."""
     state, *more = _read_text(f"/proc/{pid}/stat").rpartition(")")[2].split() or [""]
     return "" if state in ("", "Z", "X", "x") else more[18]
 
@@ -148,11 +148,12 @@ class RunningCall:
 def record_call(
     store: Store, command: str, works_on: Iterable[str], options: object = None, *, jobs: int = 1
 ) -> Iterator[RunningCall]:
-    """Record that a call begins, before the store is scanned, and how it ends; a call that is killed or interrupted has no end.
+    """Record the begin of a call before the store is scanned, and its end; a killed or interrupted call has no end.
 
     When it ends well, killed calls that were to do the same are closed.
 
-    ``works_on`` are logs and folders, or the output, in full; ``options`` distinguish its work from that of another call.
+    ``works_on`` are logs and folders, or the output, in full; ``options`` distinguish its work from that of another
+    call.
     """
     begin_s, cpu_s = time.monotonic(), _read_cpu_s()
     names = [name for file in store.place.list("calls") if (name := parse_name("calls", file)) is not None]

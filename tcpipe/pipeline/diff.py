@@ -1,4 +1,4 @@
-"""Changes between two datasets and their causes: code, recipe keys, logs, maps, region; with the shift of the labels."""
+"""Changes between two datasets and their causes: code, recipe keys, logs, maps, region; and shifts of labels."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ class Difference:
     labels: Mapping[str, Mapping[str, float]]
     """For every label: means and deviations over all samples."""
     changes: Mapping[str, Mapping[str, float]]
-    """For every label and its σ: median and largest absolute change, of a label also in σ of the first (``largest_in_std``); over the
-    samples of one run that share most of their time."""
+    """For every label and its σ: median and largest absolute change, of a label also in σ of the first
+    (``largest_in_std``); over the samples of one run that share most of their time."""
     findings_gone: tuple[Finding, ...]
     """Findings of the first, by code and subject, that the second lacks: its own, its runs' and its maps'."""
     findings_new: tuple[Finding, ...]
@@ -156,7 +156,7 @@ def _measure_changes(directories: tuple[Path, Path]) -> dict[str, dict[str, floa
 
 
 def _match_by_time(a: pa.Table, b: pa.Table) -> tuple[Ints, Ints]:
-    """Return the rows of samples of one run that share most of the longer one's time: on another track a run is cut elsewhere."""
+    """Return the samples of one run that share most of the longer one's time: another track is cut at other places."""
     runs = pc.unique(b.column("run_id"))
     run = [pc.index_in(table.column("run_id"), value_set=runs).fill_null(-1).to_numpy() for table in (b, a)]
     begin_b, end_b, begin_a, end_a = (to_integers(table, f"{end}_ns") for table in (b, a) for end in ("start", "end"))
@@ -173,7 +173,7 @@ def _match_by_time(a: pa.Table, b: pa.Table) -> tuple[Ints, Ints]:
 
 
 def _find_differing(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> Mask:
-    """Mark the given rows of two datasets, (N,), that differ in any of the columns; values missing in both are equal."""
+    """Mark the given rows of two datasets, (N,), that differ in any column; values missing in both are equal."""
     other = np.zeros(len(both[0][1]), np.bool_)
     for name in names:  # one at a time: a large dataset has gigabytes of them
         ours, theirs = (read_samples(directory, [name]).column(name).take(pa.array(rows)) for directory, rows in both)
@@ -189,7 +189,7 @@ def _find_differing_patches(
     in_a: Ints,
     in_b: Ints,
 ) -> Mask:
-    """Mark the samples of both, (N,), that have other pixels: all if layers or size differ, none if a dataset has no patches."""
+    """Mark samples of both, (N,), with different pixels: all if layers or size differ, none if one has no patches."""
     if not (cards[0].layers and cards[1].layers):
         return np.zeros(len(in_a), np.bool_)
     if set(cards[0].layers) != set(cards[1].layers) or cards[0].patch_px != cards[1].patch_px:

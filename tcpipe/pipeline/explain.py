@@ -123,8 +123,8 @@ class Explained:
 def explain(sample_id: str, *, dataset: Location = "dataset", store: Location = "tcpipe-store") -> Explained:
     """Return where a sample of a dataset came from.
 
-    Raises `DatasetError`, `StoreError`: there is no such dataset, sample or store, the dataset is of another data model, or the store no
-    longer contains the sample's run.
+    Raises `DatasetError`, `StoreError`: there is no such dataset, sample or store, the dataset is of another data
+    model, or the store no longer contains the sample's run.
     """
     opened = open_store(store)
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)

@@ -75,7 +75,7 @@ class ExportedTopic:
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """The files, what the log had lost, and what else is worth saying of it; ``unchanged`` where all was there already."""
+    """The files, losses of the log, and further notes; ``unchanged`` if all files existed already."""
 
     log: str
     out: Path
@@ -90,14 +90,14 @@ class Exported:
 def export(
     log_path: Location, out: Path, *, topics: Sequence[str] = (), message_definitions: Path | None = None
 ) -> Exported:
-    """Write each topic to ``out/<topic>.parquet``: one row a message, columns by dotted field name, the definition in the metadata.
+    """Write each topic to ``out/<topic>.parquet``: a row per message, columns by dotted field name, its definition.
 
-    The log, or that at a URL, is read once and written piece by piece: memory does not grow with it. Topics of the same log that ``out``
-    has are not written again. Without ``topics`` all are written; one text may name several, divided by commas. ``message_definitions``
-    is a directory of .msg or .idl files for types that the log does not define.
+    The log, or that at a URL, is read once and written piece by piece: memory does not grow with it. Topics of the same
+    log that ``out`` has are not written again. Without ``topics`` all are written; one text may name several, divided
+    by commas. ``message_definitions`` is a directory of .msg or .idl files for types that the log does not define.
 
-    `LogError`: the log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another
-    log or to no export, or ``out`` is a dataset, run, map, model, cost map or store.
+    `LogError`: the log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file
+    belongs to another log or to no export, or ``out`` is a dataset, run, map, model, cost map or store.
     """
     _refuse_what_is_ours(out)
     clear(out)
@@ -135,7 +135,7 @@ def export(
 
 
 def _select_topics(log: AnyLog, log_path: str, topics: Sequence[str]) -> list[str]:
-    """Return the topics asked for, each once, or all; a text that is no topic's name is taken for several with commas between."""
+    """Return the requested topics, each once, or all; a text that names no topic is split at its commas."""
     parts = (part.strip() for text in topics for part in ([text] if text in log.topics else text.split(",")))
     split = list(dict.fromkeys(part for part in parts if part))
     missing = [name for name in split if name not in log.topics]

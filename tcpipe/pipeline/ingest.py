@@ -65,7 +65,7 @@ Item: TypeAlias = tuple[int, IngestTask]
 
 
 def iterate_rounds(steps: Sequence[PlannedLog]) -> list[list[Item]]:
-    """Return logs to ingest side by side, then those with the size of one of them: the first of equal logs names their run."""
+    """Return logs to ingest in parallel, then those of equal size: the first of equal logs names their run."""
     sizes, rounds = set[int](), [list[Item](), list[Item]()]
     for index, step in enumerate(steps):
         if step.is_todo:
@@ -123,14 +123,14 @@ class CallOptions:
     as_one: bool = False
     message_definitions: str | None = None
     recipe: str | None = None
-    """Key of the recipe that ruled; None where it could not be read. `tcpipe status` asks under the one that rules then."""
+    """Key of the recipe in use; None if it could not be read. `tcpipe status` uses the one in use at its call."""
 
 
 def run_ingest(options: IngestOptions) -> IngestSummary:
     """Ingest logs (files, ROS 2 bag directories, folders of them) into the store; what is there already is left alone.
 
-    Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` when nothing can be begun; what goes wrong with one log or path stands
-    in its result.
+    Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` when nothing can be begun; what goes wrong with one
+    log or path stands in its result.
     """
     refuse_import_of_script(options.jobs)
     opened = open_store(options.store, create=True)

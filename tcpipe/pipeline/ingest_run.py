@@ -58,7 +58,7 @@ class Ingested:
 
 
 def ingest_one(task: IngestTask) -> Ingested:
-    """Ingest one run from its log as that is now; every error becomes its result, so that one log never costs the others."""
+    """Ingest one run from its log as it is now; every error becomes its result, so that other logs are not affected."""
     return_freed_memory()
     task = replace(task, source=task.source.now())
     hashed = list[str]()
@@ -130,8 +130,8 @@ def tag_log(store: Store, state: State, sha256: str, given: Mapping[str, str]) -
 def _find_hash(state: State, log: AnyLog) -> str:
     """Return the hash by which the store knows a log, or is to know it (ADR-36).
 
-    That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A run with damage
-    is not taken for it: what was broken there may be whole here.
+    That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A
+    run with damage is not taken for it: what was broken there may be whole here.
     """
     outline, sha256 = log.outline, log.sha256()
     for row in state.runs.values() if outline else ():
@@ -298,7 +298,8 @@ def run_stages(
 ) -> tuple[Track, MaskedTrack, LabelledSegments]:
     """Run fuse, gate, segment and label over the streams of one run.
 
-    A stage gets its own section, and of the others nothing but the chord; no section that `recipe_id` is not the hash of is in reach.
+    A stage gets its own section, and of the others nothing but the chord; no section that `recipe_id` is not the hash
+    of is in reach.
     """
     from tcpipe.stages.fuse import fuse_run  # noqa: PLC0415  kernels load only when there is work
     from tcpipe.stages.label import label_segments  # noqa: PLC0415

@@ -111,10 +111,10 @@ def inspect(
     message_definitions: Path | None = None,
     store: Location = "tcpipe-store",
 ) -> Inspected:
-    """Return the content of a path or a run of the store; with ``full`` read every message of a log, for damage, gaps and clocks.
+    """Return the content of a path or a stored run; with ``full`` read every message, for damage, gaps and clocks.
 
-    ``message_definitions`` is a directory of .msg or .idl files for types that a log does not define. `UsageError`, `LogError`,
-    `MapError`, `DatasetError`, `StoreError`: the path is something else, or cannot be read.
+    ``message_definitions`` is a directory of .msg or .idl files for types that a log does not define. `UsageError`,
+    `LogError`, `MapError`, `DatasetError`, `StoreError`: the path is something else, or cannot be read.
     """
     ask = partial(
         _inspect_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions

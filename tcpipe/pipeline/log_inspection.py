@@ -104,8 +104,8 @@ def inspect_log(
 ) -> InspectedLog:
     """Return what a log holds.
 
-    With ``full`` every message is read: counts, gaps, stamps, clock steps and damage; with ``reads_roles`` those of the used topics, for
-    the proposed recipe.
+    With ``full`` every message is read: counts, gaps, stamps, clock steps and damage; with ``reads_roles`` those of the
+    used topics, for the proposed recipe.
     """
     known = load_profiles(recipe)
     config = find_read_config(recipe, log.topics)
@@ -210,7 +210,7 @@ def _add_stamps(
 
 
 def _find_slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, known: Profiles) -> Iterable[Finding]:
-    """Yield a finding for each power topic that is too slow for segments, with the setting of its rate where one is known."""
+    """Yield a finding for each power topic that is too slow for segments, with the setting of its rate if known."""
     robot = known.robots[cast.robot]
     for name in cast.roles["power"].topics if "power" in cast.roles else ():
         topic = log.topics[name]

@@ -1,4 +1,4 @@
-"""Logs as they lie on disk: which files are one run, what they are called, whose turn they are, and which hold the same recording."""
+"""Logs on disk: which files are one run, their names, their share, and which hold the same recording."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _LONGEST_STEM_BYTES = 200
 
 @dataclass(frozen=True, slots=True)
 class LogSource:
-    """One log (several files of one drive with ``--as-one``): paths, and size [byte] and modification time [ns] of every file.
+    """One log (several files of a drive with ``--as-one``): paths, size [byte] and modification time [ns] of each file.
 
     A link is called what the user calls it: names, and what they say, are those of the link, not of what it leads to.
     """
@@ -99,7 +99,7 @@ class LogSource:
         return max((time_ns for _, time_ns in self.files), default=0)
 
     def now(self) -> LogSource:
-        """Return the log as it is now: a file that was written since has another content; object storage is not listed again."""
+        """Return the log as it is now, since a file may have changed; object storage is not listed again."""
         if self.urls:
             return self
         files = _list_file_states(self.paths)
@@ -126,8 +126,8 @@ def list_log_sources(
 ) -> FoundLogs:
     """Return the logs at or below the given paths.
 
-    With ``as_one`` they are all parts of one. Logs in object storage get stand-ins in ``staging``. A folder with one of the files
-    of ``tables`` is a log; if their names have a ``*``, the files of each run are one log.
+    With ``as_one`` they are all parts of one. Logs in object storage get stand-ins in ``staging``. A folder with one of
+    the files of ``tables`` is a log; if their names have a ``*``, the files of each run are one log.
     """
     paths: dict[str, list[tuple[Path, str]]] = {}
     urls: dict[Path, str] = {}
@@ -189,7 +189,7 @@ def find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
 
 
 def _find_lone_parts(paths: Iterable[Path], *, together: bool) -> Iterator[tuple[Path, str]]:
-    """Yield the files that are parts of a ROS 2 bag, given without the others: only the first part has static transforms."""
+    """Yield files that are parts of a ROS 2 bag without its others: only the first part has static transforms."""
     folders: dict[str, list[Path]] = {}
     for path in paths:
         if str(path).endswith(STORAGE_SUFFIXES):
@@ -203,7 +203,7 @@ def _find_lone_parts(paths: Iterable[Path], *, together: bool) -> Iterator[tuple
 
 
 def select_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[int]:
-    """Return which logs belong to share ``(i, n)``, i from 1, by a hash of their names in the folder given, wherever that is mounted."""
+    """Return the logs of share ``(i, n)``, i from 1, by a hash of their names in the given folder, at any mount."""
     index, count = shard
     return [at for at, source in enumerate(sources) if int(digest(source.place)[:8], 16) % count == index - 1]
 
@@ -247,7 +247,7 @@ def _list_file_states(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
 
 
 def _stat_files(path: Path) -> list[os.stat_result]:
-    """Return what the file system has of a file, or of all files below a directory; nothing of what cannot be looked at."""
+    """Return the file system's entries of a file, or of all files below a directory, without unreadable ones."""
     try:
         seen = os.stat(path)  # noqa: PTH116
     except OSError:
@@ -266,13 +266,13 @@ def recall_hash(source: LogSource, seen: LogSnapshot | None) -> LogSource:
 
 
 def find_damaged_log(damage: Sequence[Finding], subject: Subject) -> tuple[Finding, ...]:
-    """Return the finding that a log is damaged, which decides exit codes and is acknowledged, whatever the damage is called."""
+    """Return the finding that a log is damaged, which decides exit codes and can be acknowledged."""
     places = sum(finding.numbers.get("places_count", 1) for finding in damage)
     return (make_finding("log-damaged", subject, damage_count=places),) if damage else ()
 
 
 def find_total_loss(topics: Iterable[Topic], damage: Sequence[Finding]) -> tuple[str, ...]:
-    """Return the problem that damage leaves no message of any topic, if so: then no sensor is missing, but the file is cut."""
+    """Return the problem that damage leaves no message, if so: then no sensor is missing, but the file is cut."""
     is_lost = damage and all(topic.message_count == 0 for topic in topics)
     return ("the log is damaged, and no message can be read",) if is_lost else ()
 

@@ -60,8 +60,8 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
 
     A second call with the same files and options does nothing.
 
-    Raises `MapError`, `StoreError`: a raster cannot be had or placed, the classes are not the store's, or the store cannot be written: the
-    store is as it was.
+    Raises `MapError`, `StoreError`: a raster cannot be had or placed, the classes are not the store's, or the store
+    cannot be written: the store is as it was.
     """
     opened = open_store(options.store, create=True)
     with record_call(opened, ADD_MAP, [options.name]) as call:
@@ -136,7 +136,7 @@ def _make_added(store: Store, record: StoredMap, status: Literal["done", "unchan
 
 
 def _find_files(given: Mapping[str, Files]) -> dict[str, list[Path]]:
-    """Return the files of every role: patterns become the files that match, by name; of one that comes twice the last counts."""
+    """Return the files of every role: patterns become matching files by name; the last of equal files counts."""
     files: dict[str, list[Path]] = {}
     problems: list[str] = []
     for role, value in given.items():
@@ -227,7 +227,7 @@ def _describe_change(role: str, before: Mapping[str, str], now: Mapping[str, str
 
 
 def _agree_classes(store: Store, state: State, name: str) -> ClassScheme | None:
-    """Return the classes that the store's other maps share; None if no other map has classes that a user or a raster named."""
+    """Return the classes of the store's other maps; None if none of them has classes named by a user or a raster."""
     for other, record in state.maps.items():
         if other == name:
             continue

@@ -32,7 +32,7 @@ class IngestOptions:
     """Which logs are ingested, into which store, and how."""
 
     logs: Iterable[Location] = required(Option(kind="several", metavar="LOG...", repeatable=True, is_argument=True))
-    """Files, ROS 2 bag directories, folders searched downward, or URLs of such (``s3://…``), which are read by range or copied."""
+    """Files, ROS 2 bag directories, folders (searched), or URLs of such (``s3://…``), read by range or copied."""
     _: KW_ONLY
     store: Location = option("tcpipe-store", STORE)
     recipe: Recipe | Location | None = option(None, RECIPE)
@@ -76,7 +76,7 @@ class IngestOptions:
 
 
 Files: TypeAlias = Location | Sequence[Location]
-"""A file, a pattern of files such as ``dem/*.tif`` (its files by name), or several of both: tiles of one grid, the last on top."""
+"""A file, a pattern of files such as ``dem/*.tif`` (by name), or several: tiles of one grid, the last on top."""
 
 
 def _raster(about: str) -> Option:
@@ -98,7 +98,7 @@ class AddMapOptions:
     classes: Location | None = option(
         None, "Class table: CSV with value,id,name,traversable, or TOML.", (), "input_file", "FILE"
     )
-    """None takes the store's, else the paper's seven classes. The first map with terrain or classes sets the store's table."""
+    """None: the store's, else the paper's seven classes. The first map with terrain or classes sets the table."""
     layer: Mapping[str, Files] | None = option(
         None, "Another raster of one band, as layer NAME; repeatable.", (), "layers", "NAME=FILE"
     )
@@ -125,7 +125,7 @@ class BuildDatasetOptions:
     """Which runs and maps a dataset is made from, and how."""
 
     out: Location = option("dataset", kind="published", metavar="[OUT]", is_argument=True)
-    """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a folder of its own."""
+    """A new or empty directory, or one with a dataset of the same options; or a URL, where each build has a folder."""
     _: KW_ONLY
     split: Location | None = option(
         None, "GeoJSON region (WGS84): inside is train and test, outside is unseen.", (), "input_file", "FILE"

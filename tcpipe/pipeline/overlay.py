@@ -1,6 +1,7 @@
-"""A run as a log for a viewer that also shows the recorded log: track, segments, masked rows and rejections on the recorder's clock.
+"""A run as a log for a viewer, on the recorder's clock: track, segments, masked rows and rejections.
 
-ROS 2 messages in MCAP: Foxglove, Rerun and PlotJuggler all read them (docs/how-to/viewers.md). Their fields are the tables' columns.
+ROS 2 messages in MCAP: Foxglove, Rerun and PlotJuggler all read them (docs/how-to/viewers.md). Their fields are the
+tables' columns.
 """
 
 from __future__ import annotations
@@ -67,8 +68,9 @@ class Overlay:
 def write_overlay(name: str, out: Path, *, store: Location = "tcpipe-store") -> Overlay:
     """Write what became of a run as an MCAP of ROS 2 messages, whole or not at all; the same run gives the same bytes.
 
-    `UsageError`: there is no run of this name (RUN or RUN/RECIPE), or it is under several recipes, or ``out`` is there and no overlay: a
-    recording is never replaced; `StoreError`: a file of the run, or its streams, which know the recorder's clock, is not as it was written.
+    `UsageError`: there is no run of this name (RUN or RUN/RECIPE), or it is under several recipes, or ``out`` is there
+    and no overlay: a recording is never replaced; `StoreError`: a file of the run, or its streams, which know the
+    recorder's clock, is not as it was written.
     """
     run = find_named_run(name, store)
     _refuse_others(out)
@@ -122,7 +124,7 @@ def _iterate_streams(run: StoredRun) -> Iterator[MessageStream]:
 
 
 class _Clock:
-    """When the recorder received what was measured at a time, by the messages of one role; in between the delay is interpolated."""
+    """Times of reception of measurements, by the messages of one role; in between the delay is interpolated."""
 
     def __init__(self, rows: pa.Table) -> None:
         self._epoch, stamps = _read_column(rows, "clock_epoch"), _read_column(rows, "stamp_ns")
@@ -196,7 +198,7 @@ def _iterate_masks(reasons: NDArray[np.str_], times: Ints) -> Iterator[MessageSt
 
 
 def _iterate_messages(name: str, stamp: str, table: pa.Table, times: Ints) -> Iterator[MessageStream]:
-    """Yield the rows of a table as messages of a type of their own: a field a column, null as NaN; rows of equally long texts together."""
+    """Yield rows of a table as messages of an own type: a field per column, null as NaN, by lengths of texts."""
     kinds = {field.name: _ROS_TYPES[field.type] for field in table.schema}
     definition = "std_msgs/Header header\n" + "".join(f"{kind} {column_name}\n" for column_name, kind in kinds.items())
     columns = _make_header(_read_column(table, stamp))

@@ -1,4 +1,4 @@
-"""Tasks and results of ``ingest``, and what each log needs: the one decision that it executes and ``--dry-run`` and ``status`` show."""
+"""Tasks and results of ``ingest``, and the decision for each log, which ``--dry-run`` and ``status`` show, too."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class IngestTask:
     min_age_s: float = 0.0
 
     def is_made_by(self, made: RunFacts) -> bool:
-        """Return whether a run of this content is as it would be made now; a damaged log is read again by each version."""
+        """Return whether a run of this content is as a new one would be; each version reads damaged logs again."""
         same_robot = made.robot_requested == self.robot or (self.robot is not None and made.robot == self.robot)
         same_version = (made.data_model_version, made.results_version) == (DATA_MODEL_VERSION, RESULTS_VERSION)
         same_version &= made.tcpipe_version == __version__ or not made.damage
@@ -57,7 +57,7 @@ class IngestTask:
 
     @property
     def failure_key(self) -> str:
-        """Key of a failure because of the content of the log: the same content, treated in the same way, fails again."""
+        """Key of a failure because of the log's content: the same content with the same settings fails again."""
         content = self.source.sha256 or self.source.files_digest
         return make_key(content, __version__, ingest_key(self.recipe), self.robot, self.definitions)
 

@@ -1,6 +1,7 @@
-"""Check a short test log before a campaign: expected segments per hour, losses of distance, uncertainty of labels, and remedies.
+"""Check a short test log before a campaign: segments per hour, lost distance, uncertainty of labels, remedies.
 
-The excerpt goes through the very stages that ingest runs, in memory: what is predicted of a log is what ingesting it would give.
+The excerpt goes through the very stages that ingest runs, in memory: what is predicted of a log is what ingesting it
+would give.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _WINDOW_S, _FEWEST_WINDOWS = 10.0, 3
 
 @dataclass(frozen=True, slots=True)
 class RoleTopic:
-    """A topic that plays a role: how often it comes, how often it should, and which share of the log it covers at its rate."""
+    """A topic with a role: its rate, the expected rate, and the share of the log that it covers at its rate."""
 
     role: str
     topic: str
@@ -145,8 +146,9 @@ def preflight(
 ) -> Preflight:
     """Return what recording like this promises.
 
-    ``log`` is a minute or more, of any container, or the URL of one, of a folder of logs the first; all of it is read. The rest is as
-    `tcpipe.pipeline.ingest.ingest` takes it. `LogError`, `RecipeError`: it is no log, or cannot be read at all.
+    ``log`` is a minute or more, of any container, or the URL of one, of a folder of logs the first; all of it is read.
+    The rest is as `tcpipe.pipeline.ingest.ingest` takes it. `LogError`, `RecipeError`: it is no log, or cannot be read
+    at all.
     """
     robot = robot or recipe.robot
     path = log if is_url(log) else Path(log)
@@ -237,7 +239,7 @@ def _iterate_topics(facts: StageFacts, span_s: float) -> Iterator[RoleTopic]:
 
 
 def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:
-    """Yield a warning for each role without a topic, before it is too late to record one; none for a role that the recipe does without.
+    """Yield a warning for each role without a topic while it can be recorded; none if the recipe does without the role.
 
     Without GNSS or power there is no sample: these are missed whatever the recipe says.
     """

@@ -1,4 +1,4 @@
-"""Problems of runs, logs and calls: what causes exit code 3 until somebody acknowledges it; identified by code and content."""
+"""Problems of runs, logs and calls, which cause exit code 3 until acknowledged; identified by code and content."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def find_incomplete_maps(state: State, name: str | None = None) -> Iterator[Prob
 
 
 def make_missing(path: str, state: State) -> Problem:
-    """Return the problem that a path given to `ingest` holds no log; after the next call that is given the path it is a new one."""
+    """Return the problem that a path given to `ingest` has no log; each later call with the path raises a new one."""
     latest = max((call.begin for call in _list_ingests(state) if path in call.works_on), default="")
     return Problem(make_finding("log-missing", Subject("log", path)), f"{path} {latest}", (path,))
 
@@ -62,7 +62,7 @@ def is_acknowledged(problems: Sequence[Problem], state: State) -> bool:
 
 
 def find_known_problems(state: State) -> Iterator[Problem]:
-    """Yield the problems that the documents of a store have: of logs and runs, of killed calls, and of documents themselves."""
+    """Yield the problems in a store's documents: of logs and runs, of killed calls, and of the documents themselves."""
     for failure in state.failed.values():
         yield make_failure(failure.content, failure.log)
     for row in state.runs.values():
@@ -91,12 +91,12 @@ def find_stale_outputs(store: Store, state: State) -> Iterator[Problem]:
 
 
 def acknowledge(names: Sequence[str], *, store: Location = "tcpipe-store") -> Acknowledged:
-    """Acknowledge the problems of runs, logs, datasets and killed calls: they cause no exit code 3 any more, until the content is another.
+    """Acknowledge problems of runs, logs, datasets and killed calls: no exit code 3 until their content changes.
 
     A run whose tables are missing is given up: it is not expected any more. A killed call counts as ended.
 
-    Raises `StoreError`: there is no store, or it cannot be written; `UsageError`: a name is not that of one run, log or dataset
-    with a problem; nothing is acknowledged then.
+    Raises `StoreError`: there is no store, or it cannot be written; `UsageError`: a name is not that of one run, log or
+    dataset with a problem; nothing is acknowledged then.
     """
     opened = open_store(store)
     with record_call(opened, ACKNOWLEDGE, names) as call:

@@ -1,4 +1,4 @@
-"""The recipe that a log, or a folder of tables, proposes: what is found in it, with a value of each, and what a person has to decide."""
+"""The recipe proposed for a log or a folder of tables: findings with a value of each, and the user's decisions."""
 
 from __future__ import annotations
 
@@ -66,7 +66,8 @@ if TYPE_CHECKING:
 class ProposedLine:
     """One line of a recipe that is proposed for a log; one that a person has to decide is a comment.
 
-    ``table`` is the dotted name of its table, "" for keys before all tables; ``note`` is a value of the log, or what there is to decide.
+    ``table`` is the dotted name of its table, "" for keys before all tables; ``note`` is a value of the log, or what
+    there is to decide.
     """
 
     table: str
@@ -110,7 +111,7 @@ class ProposedRecipe:
 def propose_lines(
     tables: Mapping[str, Keys | Sequence[Keys]], notes: Mapping[str, str], doubt: str
 ) -> Iterator[ProposedLine]:
-    """Yield the lines of a remedy's tables; ``notes`` are by the name of a key or an array, ``doubt`` is what they leave to a person."""
+    """Yield the lines of a remedy's tables; ``notes`` are by name of a key or array, ``doubt`` is left to the user."""
     for table, keys in tables.items():
         if not isinstance(keys, Mapping):
             yield ProposedLine("", table, keys, "; ".join(filter(None, [notes.get(table), doubt])), not doubt)
@@ -122,7 +123,7 @@ def propose_lines(
 
 
 def propose_places(frames: Iterable[tuple[str, str]]) -> Iterator[ProposedLine]:
-    """Yield a line for each sensor whose place on the robot must be measured; ``frames`` are pairs of role and frame."""
+    """Yield a line for each sensor whose place on the robot must be measured; ``frames``: pairs of role and frame."""
     for role, frame in frames:
         note = f"measure it from base_link: nothing places {frame or 'it'}"
         yield ProposedLine("read.extrinsics", role, make_place_to_measure(role), note, is_certain=False)
@@ -162,8 +163,8 @@ def propose_for_log(
 ) -> ProposedRecipe:
     """Return the recipe for a log as ``init --from`` writes it: what a recipe does not settle yet.
 
-    ``proposals`` are what `find_proposals` finds in it. Unless it ``is_complete``, values are those of the first messages, and extrinsics
-    from moving transforms are left out.
+    ``proposals`` are what `find_proposals` finds in it. Unless it ``is_complete``, values are those of the first
+    messages, and extrinsics from moving transforms are left out.
     """
     config = find_read_config(recipe, log.topics)
     used = {name: role for role, names in assigned.choices.items() for name in names}
@@ -259,7 +260,7 @@ _HINTS = {
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """A table, or one of as many runs: its ``file`` as the recipe names it, columns of numbers, clock, and the recipe's keys of stamps."""
+    """A table, or one of several runs: ``file`` as in the recipe, numeric columns, clock, and its stamps' keys."""
 
     file: str
     path: Path
@@ -276,7 +277,7 @@ class _Table:
         return int(ns.min()), int(ns.max())
 
     def overlap_ns(self, other: _Table) -> int:
-        """Return the time that two tables have in common; that of stamps of different kinds, but for counters, is unknown."""
+        """Return the common time of two tables; unknown for stamps of different kinds, except counters."""
         spans = [self.span_ns, other.span_ns]
         kinds = {self.clock.kind, other.clock.kind}
         if len(kinds) > 1:
@@ -285,10 +286,10 @@ class _Table:
 
 
 def propose_tables(path: Path) -> ProposedRecipe:
-    """Return the recipe for a table, or those in a folder, that have known names; its head lists their columns and what cannot be read.
+    """Return the recipe for tables with known names; its head lists their columns and the unreadable ones.
 
-    Of several tables for a role, that is used which covers the drive of the others best. Tables that contradict others in the first minute
-    are comments.
+    Of several tables for a role, that is used which covers the drive of the others best. Tables that contradict others
+    in the first minute are comments.
     """
     from tcpipe.formats.logs.table_log import read_table_header  # noqa: PLC0415  polars only where a table is read
 
@@ -337,10 +338,10 @@ def propose_tables(path: Path) -> ProposedRecipe:
 
 
 def _group_files(folder: Path, columns: Mapping[Path, Sequence[str]]) -> dict[str, Path]:
-    """Return the files of the largest run by their names in the recipe, in which a * replaces the part that differs between runs.
+    """Return the files of the largest run by their names in the recipe, with * for the part that differs between runs.
 
-    A part of a name differs between runs if every table has several such files with the same columns. Files of one kind of table are logs
-    of all sensors; else the numbers may be those of motors.
+    A part of a name differs between runs if every table has several such files with the same columns. Files of one kind
+    of table are logs of all sensors; else the numbers may be those of motors.
     """
     names = {file: file.relative_to(folder).as_posix() for file in columns}
     if len(names) == 1:  # the next log of this recorder has another number
@@ -438,7 +439,7 @@ _TIMES_RADIUS = " * 0.1"
 
 
 def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> tuple[dict[str, Floats], dict[str, str]]:
-    """Return the values of columns by field in its unit, without those that hold no number, and the units that the recipe has to state.
+    """Return values of columns by field in its unit, without columns that have no number, and the units to state.
 
     These are the units of expressions whose columns have another one than the field.
     """
@@ -459,7 +460,7 @@ def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> tuple[
 def _judge_values(
     role: str, mapped: Mapping[str, str], values: Mapping[str, Floats]
 ) -> tuple[dict[str, str], str] | None:
-    """Return the columns with the factors that their values show, and what these leave unclear; None where they are no power."""
+    """Return the columns with the factors that their values show, and the doubts; None if they are no power."""
     if role in ("gnss", "imu"):
         judged, doubt = judge_fields(role, {field: quote(text) for field, text in mapped.items()}, values)
         return {field: mapped[field] if text == quote(mapped[field]) else text for field, text in judged.items()}, doubt
@@ -473,7 +474,7 @@ def _judge_values(
 
 
 def _propose_rest(role: str, tables: Sequence[_Table], used: str) -> Iterator[ProposedLine]:
-    """Yield the table of a role that is not found as comments, for the first that names or units suggest, with three values of each."""
+    """Yield the table of a role that was not found as comments, for the first likely column, with three values."""
     units = {unit for field in MAPPED[role].values() if field.unit not in ("1", "m") for unit in UNITS[field.unit]}
     for table in tables:
         stamp = table.stamp_lines["stamp"][0]
@@ -499,9 +500,9 @@ def _align_clocks(
 ) -> tuple[list[ProposedLine], list[str]]:
     """Return the lines with the offsets of tables on another clock, and the names of tables whose offsets are unknown.
 
-    Offsets are found by speed and turn rate. The tables ``apart`` have no time in common with the reference: their offsets are searched up
-    to five minutes around the one at which both tables begin together. A table without motion has the clock of a table with which it has
-    time in common.
+    Offsets are found by speed and turn rate. The tables ``apart`` have no time in common with the reference: their
+    offsets are searched up to five minutes around the one at which both tables begin together. A table without motion
+    has the clock of a table with which it has time in common.
     """
     from tcpipe.stages.fuse_clocks import find_late_sensors  # noqa: PLC0415  kernels load only where there is work
 
@@ -524,7 +525,7 @@ def _align_clocks(
 
 
 def _make_recipe(lines: Sequence[ProposedLine]) -> Recipe:
-    """Return the recipe of the tables in certain lines, and in lines of the time zone and format, which a trial confirms."""
+    """Return the recipe of the tables in certain lines, and in lines of time zone and format that a trial confirms."""
     tried = [line for line in lines if line.is_certain or line.key in ("stamp_zone", "stamp_format")]
     text = ProposedRecipe([], [replace(line, is_certain=True) for line in tried], "").toml()
     tables = {name: of for name, of in tomllib.loads(text).get("tables", {}).items() if "columns" in of}

@@ -1,7 +1,7 @@
-"""Removal of what a store no longer needs: replaced documents, given-up runs, payload that no document names; nothing of a dataset.
+"""Removal of replaced documents, given-up runs and unnamed payload from a store; datasets are not changed.
 
-A removal is safe beside other calls (ADR-36): only documents that did not count in a first scan go, and only payload that was listed before
-a second scan and that no document of this scan names. While another call may run, nothing goes.
+A removal is safe beside other calls (ADR-36): only documents that did not count in a first scan go, and only payload
+that was listed before a second scan and that no document of this scan names. While another call may run, nothing goes.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ def prune(
 
     Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, it cannot be written to, or a name is unknown.
 
-    Without ``runs`` (RUN or RUN/RECIPE), superseded runs go, and those under an old recipe whose log also has a run under the ``recipe``
-    that rules. What a dataset refers to stays, unless another dataset lies at its place or ``forget`` names it. With ``dry_run`` nothing
-    changes.
+    Without ``runs`` (RUN or RUN/RECIPE), superseded runs go, and those under an old recipe whose log also has a run
+    under the ``recipe`` that rules. What a dataset refers to stays, unless another dataset lies at its place or
+    ``forget`` names it. With ``dry_run`` nothing changes.
     """
     ruling, opened = ingest_key(resolve_recipe(recipe)), open_store(store)
     forgotten, left = [make_absolute(name) for name in forget], _find_temporaries(opened)
@@ -232,7 +232,7 @@ class _Removal:
                     self.store.put_run(second, read_record(self.store.place, earlier, Run))
 
     def choose_documents(self, second: State) -> None:
-        """Choose the documents that did not count in the first scan, then calls before the latest and forgotten outputs."""
+        """Choose the documents that did not count in the first scan, then old calls and forgotten outputs."""
         counting = {*second.names.values()} - ({*self.earlier.values()} if self.dry_run else set())
         replaced = dict.fromkeys([*self.first.beaten, *self.earlier.values()])
         self.documents.append([name for name in replaced if name not in counting])

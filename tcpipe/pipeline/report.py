@@ -52,13 +52,15 @@ class Page:
 def report(
     path: Location, *, store: Location = "tcpipe-store", recipe: Recipe | Location | None = None, runs: bool = True
 ) -> list[Page]:
-    """Write ``report.html`` into a dataset or a store, here or at a URL, or beside the tables of a run of the store; return the pages.
+    """Write ``report.html`` into a dataset or a store, local or at a URL, or for a run of the store; return the pages.
 
     A page whose bytes would be the same is not written, and that of a run whose inputs are the same is not rendered.
 
-    Raises `UsageError`: the path is something else; `StoreError`: something cannot be read; all other pages of a store are written.
+    Raises `UsageError`: the path is something else; `StoreError`: something cannot be read; all other pages of a store
+    are written.
 
-    ``recipe`` is the current one: the page of a store sums over its runs. ``runs``: of a store, write the page of every run too.
+    ``recipe`` is the current one: the page of a store sums over its runs. ``runs``: of a store, write the page of every
+    run too.
     """
     is_there = is_path(path)
     is_one = is_there and is_store(path)
@@ -74,7 +76,7 @@ def report(
 
 
 def _report_store(store: Store, ruling: Recipe, *, runs: bool) -> list[Page]:
-    """Write the store's page, first, as those of the runs link to it, and again if pages of runs could not be written."""
+    """Write the store's page, first, since those of runs link to it; again if a run's page could not be written."""
     state = store.scan()
     counted = store.runs(state) if runs else []
     page = _write_store_page(store, state, ruling, will_be=counted)
@@ -106,7 +108,7 @@ def _name_page(row: RunFacts) -> str:
 
 
 def _report_runs(runs: list[StoredRun], maps: StoredMaps) -> list[Page]:
-    """Write the pages of runs of one store; `StoreError` names all that cannot be read, after the others were written."""
+    """Write the pages of runs of a store; `StoreError` names all unreadable runs after the others were written."""
     if not runs:
         return []
     place, pages, problems = maps.store.place, list[Page](), list[str]()

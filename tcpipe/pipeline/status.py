@@ -97,8 +97,8 @@ class Status:
 def find_log_states(options: IngestOptions, *, create: bool = False) -> Status:
     """Return what a call of ingest with these options would find; with ``create`` the store need not be there.
 
-    Without logs: those that the latest calls of ingest were given, with the options of these calls. A log that was written more recently
-    than ``min_age_s`` is growing.
+    Without logs: those that the latest calls of ingest were given, with the options of these calls. A log that was
+    written more recently than ``min_age_s`` is growing.
 
     Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, or nothing is known of its sources.
     """
@@ -145,7 +145,7 @@ def find_log_states(options: IngestOptions, *, create: bool = False) -> Status:
 
 _LATEST_CALLS = 50
 Asked: TypeAlias = Mapping[str, tuple[tuple[str, ...], CallOptions]]
-"""By log or folder that was given to ingest: all that the latest such call was given, and its options; the latest call first."""
+"""All inputs and options of the latest call by log or folder that was given to ingest; the latest call first."""
 
 
 def _list_asked(state: State) -> Asked:
@@ -161,7 +161,7 @@ def _list_asked(state: State) -> Asked:
 def _find_tasks(
     options: IngestOptions, asked: Asked, root: Location, recipe: Recipe
 ) -> tuple[list[IngestTask], dict[str, tuple[str, ...]]]:
-    """Return the tasks of the logs given, or of those of earlier calls with the options of these; and what holds no log."""
+    """Return the tasks of the given logs, or of those of earlier calls with equal options; and inputs without logs."""
     logs = [str(log) for log in options.logs]
     calls = dict(asked.values())
     groups = [(logs, options)] if logs else []
@@ -202,7 +202,7 @@ def _count_logs(logs: Sequence[str]) -> str:
 
 
 def _iterate_groups(steps: Iterable[PlannedLog]) -> Iterator[Group]:
-    """Yield logs of one state with findings of the same codes on the same subjects; without findings, of the same cause."""
+    """Yield logs of one state with findings of equal codes and subjects; without findings, of equal cause."""
     groups: dict[tuple[LogState, Hashable], list[PlannedLog]] = {}
     for step in steps:
         alike = frozenset(

@@ -87,7 +87,7 @@ class Verified:
 
 
 def verify(path: Location, *, store: Location = "tcpipe-store") -> Verified:
-    """Re-read a dataset, a store, a map, a model or a cost map, all but a map also at a URL; or a run of a ``store`` by its name.
+    """Re-read a dataset, store, map, model or cost map (all but maps also at a URL), or a run of a ``store`` by name.
 
     Raises `UsageError`: the path is something else.
     """
@@ -162,7 +162,7 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
 
 
 def _verify_files(place: Place, checksums: Mapping[str, Checksum], repair: str) -> Generator[CheckResult, None, bool]:
-    """Read files again and compare them with what a document has of them; return whether all are as they were written."""
+    """Read files again, compare them with their document, and return whether all are unchanged."""
     wrong = list(find_wrong_files(place, checksums))
     yield from wrong
     if wrong:

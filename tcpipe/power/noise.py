@@ -157,8 +157,7 @@ _SPACINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _FEWEST = 20
 """Fewest second differences at a spacing: their mean square is known to a third."""
 _LOCAL_NS, _PRIOR_SAMPLES, _MIN_SCALE = 2_000_000_000, 4.0, 0.05
-"""Size of the processes near a span: time before and after it [ns], weight of the whole record in samples, smallest
-value."""
+"""Processes near a span: time before and after it [ns], weight of the whole record in samples, least value."""
 _CALM_S, _CALM_SAMPLES = 1.5, 8
 """Length of a calm section [s] (shorter than a halt, longer than vibration correlates), and its fewest samples."""
 
@@ -171,8 +170,7 @@ class SignalModel:
     ----------
     error_variance : independent error of each sample.
     variance, tau_s : of each exponential of the processes' covariance, shape (K,), with its correlation time [s].
-    curvature_variance, slope_variance : mean of `compute_curvature` by the processes, and slopes of the smooth ones
-        [per s²].
+    curvature_variance, slope_variance : mean of `compute_curvature`, and slopes of smooth processes [per s²].
     """
 
     error_variance: float

@@ -12,7 +12,7 @@ KEPT = "#009e73"
 DROPPED = "#d55e00"
 SPLIT_COLOURS = {"train": "#0072b2", "test": "#e69f00", "unseen": "#c2185b", "buffer": FAINT}
 CLASS_COLOURS = ("#aa3377", "#228833", "#66ccee", "#ccbb44", "#ee6677", "#4477aa", "#bbbbbb")
-"""Paul Tol's bright scheme, of robots, runs, and classes that no word of their name colours; beyond the last they begin again."""
+"""Paul Tol's bright scheme, for robots, runs, and classes without a colour word; it repeats after the last."""
 CURSOR = "#ff2d95"
 DOUBTED = "#e69f00"
 UNUSED = "#8fd3bd"
@@ -54,7 +54,7 @@ _GROUND_COLOURS = {
 
 
 def choose_class_colours(classes: Iterable[TerrainClass]) -> dict[int, str]:
-    """Return a colour for each class id: of the class table, else by its name, else, or where it is taken, by the id."""
+    """Return a colour for each class id: of the class table, else by its name, else, or if taken, by its id."""
     chosen = dict[int, str]()
     for entry in classes:
         name = entry.name.lower()

@@ -64,8 +64,8 @@ SAMPLE_COLUMNS = (
 def render_dataset_report(directory: Path, beside: Path | None = None, *, samples: pa.Table | None = None) -> str:
     """Return the HTML page of the dataset in ``directory``; `DatasetError` for another data model.
 
-    ``beside`` is the directory of the dataset; the page links to runs of stores in it. ``samples`` has at least `SAMPLE_COLUMNS`; None
-    reads them. If patches or pictures are lost or damaged, the page says so and omits them.
+    ``beside`` is the directory of the dataset; the page links to runs of stores in it. ``samples`` has at least
+    `SAMPLE_COLUMNS`; None reads them. If patches or pictures are lost or damaged, the page says so and omits them.
     """
     card = read_intact_card(directory)
     if samples is None:
@@ -257,7 +257,7 @@ def _make_provenance_section(card: DatasetCard) -> PageSection:
 
 
 def find_nearest_train_m(xy_m: Floats, split: NDArray[np.integer]) -> tuple[Floats, NDArray[np.int32]]:
-    """Return distance [m] and row of the nearest training sample, by middles, of each held-out sample, shape (N,); NaN elsewhere.
+    """Return distance [m] and row of the nearest training sample of each held-out sample, shape (N,); NaN elsewhere.
 
     ``split`` is the number of each sample's split in `SPLITS`, shape (N,).
     """
@@ -270,7 +270,7 @@ def find_nearest_train_m(xy_m: Floats, split: NDArray[np.integer]) -> tuple[Floa
 
 
 def select_samples(card: DatasetCard, table: pa.Table) -> tuple[Floats, Json]:
-    """Return the middles of the page's samples in the first map's plane, or from the dataset's own origin, (N, 2), and their columns."""
+    """Return the middles of the page's samples in the first map's plane, or the dataset's own, (N, 2), and columns."""
     xy_m = _read_middles_m(card, table)
     apart_m, nearest = find_nearest_train_m(xy_m, _find_indices(table, "split", SPLITS))
     starts_ns = np.array(find_first_starts_ns(card, table), np.int64)

@@ -106,7 +106,7 @@ _ASIDE = {"grade": "weight over efficiency"}
 
 
 def describe_physics(robot: str, fit: PhysicsFit) -> str:
-    """Return the fit as a few sentences: the numbers that a roboticist wants first, each with its standard deviation."""
+    """Return the fit as a few sentences: the most wanted numbers first, each with its standard deviation."""
     grounds = list(dict.fromkeys(term.terrain for term in fit.terms if term.term in {"rolling", "turning"}))
     values = {(term.term, term.terrain): term for term in fit.terms}
     everywhere = [

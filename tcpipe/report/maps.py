@@ -44,7 +44,7 @@ _LEAST_SHARE = 0.5
 
 
 def draw_dataset_map(directory: Path, card: DatasetCard, xy_m: Floats) -> tuple[list[Plot], list[str]]:
-    """Return the map of the samples at ``xy_m``, (N, 2), and the plot beside it, and which parts of the map are lost."""
+    """Return the map of the samples at ``xy_m``, (N, 2), the plot beside it, and the missing parts of the map."""
     if card.maps:
         bounds = compute_joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
     elif len(xy_m):
@@ -218,7 +218,7 @@ def draw_run_map(run: StoredRun, track: pa.Table, segments: pa.Table, maps: Stor
 
 
 def draw_tracks(runs: Sequence[StoredRun], maps: StoredMaps) -> Plot | None:
-    """Return the tracks of runs on the first map that contains most of them, else in one plane; None of runs without places."""
+    """Return the tracks of runs on the first map that has most of them, else in one plane; None without places."""
     places_deg = dict[str, Floats]()
     for run in runs:
         with suppress(StoreError):
@@ -248,7 +248,7 @@ def draw_tracks(runs: Sequence[StoredRun], maps: StoredMaps) -> Plot | None:
 def _find_ground(
     run: StoredRun, lonlat: Floats, maps: StoredMaps
 ) -> tuple[tuple[Callable[[Floats], Floats], MapFile, Pictures] | None, list[str]]:
-    """Return projection, map and pictures of the first map that contains most of the track, and the maps that cannot be read."""
+    """Return projection, map and pictures of the first map that has most of the track, and unreadable maps."""
     lost: list[str] = []
     for name, record in maps.records.items():
         try:

@@ -1,7 +1,7 @@
 """The frame of every page: one self-contained HTML file, which loads nothing and works without a mouse.
 
-A page with figures (`tcpipe.report.plots.Plot`) contains BokehJS once. A page's own script is a file beside this one, which reads
-``page.data`` and finds figures by ``page.model(name)`` (``page.js``).
+A page with figures (`tcpipe.report.plots.Plot`) contains BokehJS once. A page's own script is a file beside this one,
+which reads ``page.data`` and finds figures by ``page.model(name)`` (``page.js``).
 
 Columns of numbers inside a page, small: quantised where that changes no digit that is shown, deflated, in base64.
 
@@ -132,7 +132,7 @@ def show_verdict(
     *,
     labels: Sequence[Affected] = AFFECTED,
 ) -> VerdictBox:
-    """Return a verdict: the grades of ``labels``, findings with their remedies, and ``groups`` as `describe_group` takes them."""
+    """Return a verdict: the grades of ``labels``, findings with their remedies, and ``groups`` for `describe_group`."""
     by_code: dict[tuple[Severity, str], list[Finding]] = {}
     for finding in sort_findings(findings):
         by_code.setdefault((finding.severity, finding.code), []).append(finding)
@@ -203,7 +203,8 @@ def render_page(
     sections : in the order of the page; the first is next to the verdict, the titles form the table of contents.
     links : pages that belong to it.
     script, data : file beside this one that runs when all figures are drawn, and its data.
-    made_from : digest of the inputs, by which `is_made_from` finds that the page need not be rendered again; "" if it has to be.
+    made_from : digest of the inputs, by which `is_made_from` finds that the page need not be rendered again; "" if it
+    has to be.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters["cell"] = _format_cell

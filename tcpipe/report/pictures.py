@@ -74,7 +74,7 @@ def colour_classes(ids: NDArray[np.generic], classes: ClassTable | None) -> Byte
 
 
 def colour_heights(values: NDArray[np.float64]) -> Bytes:
-    """Return each patch (N, px, px) over its own range from dark blue to yellow (cividis), shape (N, px, px, 3); no data is white."""
+    """Return each patch (N, px, px) over its range from dark blue to yellow, (N, px, px, 3), no data white."""
     known = np.isfinite(values)
     low = np.where(known, values, np.inf).min(axis=(1, 2), keepdims=True)
     high = np.where(known, values, -np.inf).max(axis=(1, 2), keepdims=True)
@@ -199,7 +199,7 @@ _MOST_PIECES = 24
 
 @dataclass(frozen=True, slots=True)
 class _Patches:
-    """Patches of a dataset; for each sample its place in the files and the piece of it, (T,); ``step`` thins the pixels."""
+    """Patches of a dataset; for each sample its place in the files and its piece, (T,); ``step`` thins the pixels."""
 
     files: PatchFiles
     place: NDArray[np.int64]
@@ -221,7 +221,7 @@ class _Patches:
         return _join_colours({layer: np.concatenate(parts)[back] for layer, parts in stacks.items()})
 
     def select(self, samples: pa.Table) -> NDArray[np.int64]:
-        """Return up to `MOST_PATCHES` rows, rising, taken in turn from each split, class and 5° of slope: always the same ones.
+        """Return up to `MOST_PATCHES` rows, rising, in turn from each split, class and 5° of slope: always the same.
 
         ``samples`` are the first ones of the dataset.
         """
@@ -273,7 +273,7 @@ def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[An
 
 
 def _make_sheet(stack: NDArray[np.generic], layer: Layer) -> tuple[NDArray[np.uint8], bool]:
-    """Return patches of a layer as one sheet, and whether every pixel counts; a photograph over the range of 98 % of its values."""
+    """Return patches of a layer as one sheet, and whether all pixels count; a photograph over 98 % of its values."""
     if layer.kind == "categorical":
         return make_sheet(colour_classes(stack, layer.classes)), True
     values = stack.astype(np.float64)

@@ -1,11 +1,13 @@
 """Interactive plots of pages: the only module that imports Bokeh.
 
-A page makes a plot, calls the glyph methods of ``plot.figure``, and hands it to a section (`tcpipe.report.page.PageSection`)::
+A page makes a plot, calls the glyph methods of ``plot.figure``, and hands it to a section
+(`tcpipe.report.page.PageSection`)::
 
     plot = new_plot("speed", alt="Speed over time", axes=("time [s]", "speed [m/s]"))
     plot.figure.line(time_s, speed_mps, color=KEPT)
 
-Colours of axes and grids follow the page's light or dark scheme (``page.css``); those of glyphs come from `tcpipe.report.colours`.
+Colours of axes and grids follow the page's light or dark scheme (``page.css``); those of glyphs come from
+`tcpipe.report.colours`.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ _UNREAD = "\u2060"
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A figure with a description for screen readers and its colours by name; the page's scripts find it by ``figure.name``."""
+    """A figure with a description for screen readers and colours by name; scripts find it by ``figure.name``."""
 
     figure: Any
     alt: str
@@ -178,10 +180,10 @@ def draw_waterfall(distance_by_reason_m: Mapping[str, float]) -> Plot:
 
 
 def render_plots(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
-    """Return Bokeh's JSON and the id of each plot; the same plots have the same ids, independent of what this process drew before.
+    """Return Bokeh's JSON and the id of each plot; the same plots have the same ids in each process.
 
-    ``first`` is a Bokeh document of all plots that do not wait. ``later`` are the roots that join it, in the order of the page; parts that
-    they share with earlier plots, such as an axis, are named there and written once.
+    ``first`` is a Bokeh document of all plots that do not wait. ``later`` are the roots that join it, in the order of
+    the page; parts that they share with earlier plots, such as an axis, are named there and written once.
     """
     if not plots:
         return None, []
@@ -198,7 +200,7 @@ def render_plots(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
 
 
 def _make_plot_json(value: Json, ids: dict[str, str]) -> Json:
-    """Return a part of Bokeh's JSON with ids in order of appearance, and texts that nothing reads as a formula or a control character."""
+    """Return a part of Bokeh's JSON with ids in order, and texts without formulas or control characters."""
     if isinstance(value, Mapping):
         return {
             key: ids.setdefault(part, f"p{len(ids) + 1}")

@@ -1,4 +1,4 @@
-"""A run over time: one axis of seconds and one cursor for all plots. The page's script fills them with the series of this module."""
+"""A run over time: one axis of seconds and one cursor for all plots, which the page's script fills with series."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Epoch:
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """The page's axis: seconds since the track began; after a step of the clock the next epoch follows a second later."""
+    """The page's axis: seconds since the track's begin; after a clock step the next epoch follows a second later."""
 
     epochs: tuple[Epoch, ...]
 
@@ -64,7 +64,7 @@ class Timeline:
         return last.start_s + (last.last_ns - last.first_ns) * 1e-9
 
     def seconds(self, stamp_ns: Ints, epoch: Ints | None = None) -> Floats:
-        """Return times of stamps [s], shape (N,), NaN outside the track; without ``epoch`` by the first epoch that contains a stamp."""
+        """Return times of stamps [s], (N,), NaN outside the track; without ``epoch`` by the first that contains it."""
         t_s = np.full(len(stamp_ns), np.nan)
         for part in self.epochs:
             within = np.isnan(t_s) & (stamp_ns >= part.first_ns) & (stamp_ns <= part.last_ns)
@@ -108,9 +108,10 @@ def downsample_columns(
     sampled: Mapping[str, Column] | None = None,
     most: int = MOST_VALUES,
 ) -> Series:
-    """Return columns with their decimals by name; of more than ``most`` values the lowest and highest of every bin stay.
+    """Return columns with decimals by name; of more than ``most`` values the extremes of every bin stay.
 
-    The two keep their order; their times are the bin's beginning and middle. Columns that are ``sampled`` keep the values there.
+    The two keep their order; their times are the bin's beginning and middle. Columns that are ``sampled`` keep the
+    values there.
     """
     count = len(t_s)
     per_bin = -(-2 * count // most) if count > most else 1
@@ -166,7 +167,7 @@ def _compute_seconds(table: pa.Table, timeline: Timeline) -> Floats:
 
 
 def make_speed_series(role: str, table: pa.Table, timeline: Timeline) -> Series | None:
-    """Return the speed [m/s] of a sensor: measured, else by chords over a second of its positions; None without either."""
+    """Return the speed [m/s] of a sensor: measured, else by positions a second apart; None without either."""
     t_s = _compute_seconds(table, timeline)
     table, t_s = table.filter(pa.array(np.isfinite(t_s))), t_s[np.isfinite(t_s)]
     speed = _read_speed(table)
@@ -217,7 +218,7 @@ class Spans:
 
 
 def find_mask_spans(track: pa.Table, timeline: Timeline, rate_hz: float) -> Spans:
-    """Return the spans, also those of kept rows (bits 0); a row lasts one period of the track, and missing rows end a span."""
+    """Return the spans, also of kept rows (bits 0); a row lasts one period of the track, missing rows end a span."""
     t_s, bits = _compute_seconds(track, timeline), to_integers(track, "dropped_by")
     period_s = 1.0 / rate_hz
     begin = np.flatnonzero(np.r_[True, (np.diff(bits) != 0) | (np.diff(t_s) > 1.5 * period_s)])

@@ -222,7 +222,7 @@ def _make_segments_data(
 def _find_severities(
     columns: Mapping[str, Column], findings: Sequence[Finding], spans: Sequence[FindingSpan]
 ) -> NDArray[np.int64]:
-    """Return the worst severity that concerns each segment by a span or a flag: its place in `SEVERITIES`, beyond them where none does."""
+    """Return the worst severity of each segment, by spans and flags: its place in `SEVERITIES`, or their number."""
     start_s, end_s = (np.asarray(columns[name][1], np.float64) for name in ("start", "end"))
     quality = np.asarray(columns["quality"][1], np.int64)
     concerned = [(span.finding.severity, (start_s <= span.end_s) & (end_s >= span.start_s)) for span in spans]

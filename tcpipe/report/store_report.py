@@ -38,7 +38,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class StoredDataset:
-    """A dataset that was built from the store: where, of which runs, whether it is still that one, and its page from the store's."""
+    """A dataset built from the store: its place, its runs, whether it is unchanged, and its page from the store's."""
 
     out: str
     runs: tuple[RunKey, ...]
@@ -165,7 +165,7 @@ def name_datasets(datasets: Sequence[StoredDataset]) -> list[str]:
 
 
 def store_report(store: StoreFacts, tracks: Plot | None = None) -> str:
-    """Return the HTML page of a store; of few runs, with their ``tracks`` on the map, these and the table come first."""
+    """Return the HTML page of a store; with ``tracks`` of few runs on the map, these and the table come first."""
     runs = sort_runs(store)
     current = [run for run in runs if run.is_current]
     groups = [(group, len(current), "runs") for group in store.groups]

@@ -1,8 +1,7 @@
 """Worlds and drives with known truth, written as real logs and GeoTIFFs.
 
 `simulate` writes a whole site: a `scenarios.Scenario` of a `world.World`, drives (routes and faults) and the rasters'
-grids. `simulate_readings` returns truth and readings of one drive; `truth.compute_true_cost` the cost of the true metre
-from any time.
+grids. `simulate_readings` returns truth and readings of a drive; `truth.compute_true_cost` the cost of a true metre.
 """
 
 from tcpipe.simulation.scenarios import Scenario, find_scenario, make_tiny

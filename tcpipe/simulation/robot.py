@@ -1,8 +1,7 @@
 """Abilities and costs of the simulated robot: speed limits, slip, rolling resistance, grade, battery, wheel bumps.
 
 The plant is simple, but contains every effect that a label should contain: the terrain slows a robot that is commanded
-at full speed, rolling resistance depends on the class (and on properties that no map shows), grade costs and gives
-back, turning scrubs, the battery sags.
+at full speed, rolling depends on the class (and on hidden properties), turning scrubs, the battery sags.
 """
 
 from __future__ import annotations
@@ -135,8 +134,7 @@ def drive_along(  # noqa: PLR0917 - numba takes positional arguments
 
     The arrays describe the ground along the path every ``grid_m`` map metres. Wheel speed follows command times
     ``speed_factor`` with a first-order lag and a limited acceleration; past ``brake_at_m`` the command is zero. Ends
-    when the wheels stop, or, with the position past the path, when the path was too short to stop on (the caller
-    checks).
+    when the wheels stop, or past the path if it was too short to stop (the caller checks).
     """
     position, wheel = np.empty(max_steps), np.empty(max_steps)
     s, w, last = 0.0, 0.0, speed_factor.size - 1

@@ -215,8 +215,7 @@ _PAPER_ROADS = (
 def make_paper_world() -> World:
     """Return a site of the paper's extent and heights (section IV-A): 596 m × 305 m, 574.8 m to 661.3 m high.
 
-    Its shape is invented: a long slope with knolls, two paved and three unpaved roads, mud in the hollows, trees and
-    hedges.
+    Its shape is invented: a long slope with knolls, two paved and three unpaved roads, mud in hollows, hedges.
     """
     parameters = read_paper_parameters()
     about, surface = parameters["site"], parameters["surface"]
@@ -364,9 +363,8 @@ SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
     "tiny": make_tiny,
     "manoeuvres": _make_manoeuvres,
 }
-"""Scenarios by name: demo (two drives of four minutes), hills12 (twelve minutes, all faults), paper (eleven drives of
-0.5 km to 1.5 km over a site of the paper's size), paper_quick (three short ones of the same robot), tiny (half a
-minute), manoeuvres (one of each, no faults)."""
+"""Scenarios by name: demo (two drives of 4 min), hills12 (12 min, all faults), paper (eleven drives of 0.5 to 1.5 km),
+paper_quick (three short ones of the same robot), tiny (half a minute), manoeuvres (one of each, no faults)."""
 
 
 def find_scenario(name: str) -> Scenario:

@@ -1,8 +1,7 @@
 """Simulated sensors: what each measures of the truth, and when the recorder receives it.
 
 A sensor samples at its own rate and phase. Its reading contains the time of measurement in the header, the time of
-recording, and columns in SI units in the sensor's own frame. Each sensor and each fault draws from its own random
-stream, named by a string.
+recording, and columns in SI units in the sensor's own frame. Each sensor and fault has a named random stream.
 """
 
 from __future__ import annotations
@@ -31,10 +30,7 @@ Values = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Switches of the faults of sensors; all off is a perfect sensor set at base_link.
-
-    Switching one changes nothing of another: every noise has a random stream of its own.
-    """
+    """Switches of independent faults of sensors (own random streams); all off is a perfect set at base_link."""
 
     gnss_noise: bool = False  # position noise, most of it correlated in time
     gnss_lever_arm: bool = False  # the antenna is not at base_link

@@ -25,8 +25,7 @@ _COMPONENTS = {
 class Truth:
     """One drive at 200 Hz; all arrays have one row a step, and base_link stands on the ground.
 
-    The local plane is east, north, up of the site's ENU origin; ``quat_xyzw``: enu_from_base_link; velocities are of
-    base_link.
+    The local plane is ENU at the site's origin; ``quat_xyzw``: enu_from_base_link; velocities are of base_link.
     """
 
     stamp_ns: Ints

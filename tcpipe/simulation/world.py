@@ -80,10 +80,7 @@ class Site:
         return np.asarray(lon), np.asarray(lat), np.asarray(alt)
 
     def ground_from_map(self, x_map_m: Floats, y_map_m: Floats, alt_m: Floats) -> tuple[Floats, Floats]:
-        """Return ground metres per map metre, and the true direction of the map's x axis from east [rad].
-
-        Ground metres are horizontal metres at the height ``alt_m`` above the ellipsoid.
-        """
+        """Return horizontal metres at height ``alt_m`` per map metre, and the map's x axis from true east [rad]."""
         lon0, lat0 = self.lonlat_deg(x_map_m - _STEP_M / 2, y_map_m)
         lon1, lat1 = self.lonlat_deg(x_map_m + _STEP_M / 2, y_map_m)
         lat = np.radians((lat0 + lat1) / 2)

@@ -1,6 +1,7 @@
 """Fuse: streams become one track of base_link, 20 times a second, with its uncertainty (L1 to L2).
 
-Time offsets between the clocks of sensors are taken out before fusion. Power is not fused, and its stamps stay as they are.
+Time offsets between the clocks of sensors are taken out before fusion. Power is not fused, and its stamps stay as they
+are.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     """Return the track of a run; rows are in order of clock epoch and stamp.
 
-    Each clock epoch, and each part of it between long pauses, is fused separately. Stamps are multiples of the track's period; where no
-    sensor measures motion for ``max_gap_s`` there are no rows, so a gap is a step in the stamps.
+    Each clock epoch, and each part of it between long pauses, is fused separately. Stamps are multiples of the track's
+    period; where no sensor measures motion for ``max_gap_s`` there are no rows, so a gap is a step in the stamps.
 
     Raises `FusionError`: no sensor measures motion, or the estimate breaks down in every section.
     """
@@ -51,7 +52,8 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
 
 def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Track:
     run, read = Subject("run", run_id), streams.report
-    # 1. Streams become sections of measurements: one frame, one set of units, usable variances, without sensors that cannot be right.
+    # 1. Streams become sections of measurements: one frame, one set of units, usable variances, without sensors that
+    # cannot be right.
     streams, is_local = use_pose_as_fixes(streams)
     sections = exclude_other_clocks(prepare_sections(streams, config), streams)
     sections = find_clocks(drop_implausible_sensors(sections, streams))
@@ -97,8 +99,8 @@ def fuse_sections(
 ) -> tuple[list[Section], Fused, list[FusionError]]:
     """Return the sections on one clock each, their track, and why some have none.
 
-    A section is fused again without the offset of a clock that its estimate finds to step. A local frame goes on from the end of the
-    section before. Where one section has a place on the earth, those without fixes are skipped.
+    A section is fused again without the offset of a clock that its estimate finds to step. A local frame goes on from
+    the end of the section before. Where one section has a place on the earth, those without fixes are skipped.
     """
     given, used, tracks, errors = [*sections], correct_clocks(sections, streams), list[Fused](), list[FusionError]()
     for place, section in enumerate(used):
@@ -127,7 +129,7 @@ def _skip(section: Section) -> Fused:
 
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
-    """Yield the findings of reading: on missing extrinsics without remedy if fusing estimates them, and not at all if none are needed."""
+    """Yield the findings of reading; missing extrinsics lose their remedy if estimated, and vanish if unused."""
     estimated = {
         role for finding in fused for remedy in finding.remedies for role in remedy.recipe.get("read.extrinsics", ())
     }

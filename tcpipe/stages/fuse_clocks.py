@@ -1,4 +1,4 @@
-"""Clocks of the sensors of each section: one that is far off the others' excludes its sensor, small offsets and drifts are taken out."""
+"""Clocks of the sensors by section: a far one excludes its sensor; small offsets and drifts are removed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from tcpipe.tables.levels import Streams
 
 
 def exclude_other_clocks(sections: Sequence[Section], streams: Streams) -> list[Section]:
-    """Return the sections without sensors whose clocks are more than a second off the others', there or where the drive is longer.
+    """Return the sections without sensors whose clocks are more than a second off in it or in the longest one.
 
     No label of the run is usable until the recipe states the offset, since it is unknown which of the clocks power has.
     """
@@ -60,7 +60,7 @@ def exclude_other_clocks(sections: Sequence[Section], streams: Streams) -> list[
 
 
 def find_late_sensors(streams: Streams, config: FuseConfig) -> dict[str, float]:
-    """Return how late sensors' stamps are against those of most sensors [s], by role; those whose offset is unknown are missing."""
+    """Return the delay of sensors' stamps against those of most sensors [s], by role, without unknown ones."""
     sections = prepare_sections(use_pose_as_fixes(streams)[0], config)
     if not sections:
         return {}
@@ -71,8 +71,9 @@ def find_late_sensors(streams: Streams, config: FuseConfig) -> dict[str, float]:
 def find_clocks(sections: Sequence[Section]) -> list[Section]:
     """Return the sections with the time offsets between their sensors.
 
-    A section decides about its own clocks. A sensor whose clock it cannot compare has the constant offset that a section with a longer
-    drive shows: latency is a constant of the driver. If the clock drifts there, its offset here is unknown, and is doubted.
+    A section decides about its own clocks. A sensor whose clock it cannot compare has the constant offset that a
+    section with a longer drive shows: latency is a constant of the driver. If the clock drifts there, its offset here
+    is unknown, and is doubted.
     """
     found = [*sections]
     shown: dict[str, tuple[ClockOffset, str, int]] = {}
@@ -93,7 +94,7 @@ def find_clocks(sections: Sequence[Section]) -> list[Section]:
 
 
 def correct_clocks(sections: Sequence[Section], streams: Streams) -> list[Section]:
-    """Return the sections on one clock each: offset and drift of each clock, about the middle of its section, are taken out."""
+    """Return the sections with one clock each: each clock's offset and drift about the section's middle are removed."""
     corrected, stated_s = [], streams.report.facts.time_offset_s.get(GNSS, 0.0)
     for section in sections:
         middle_ns = sum(section.span_ns) // 2
@@ -143,7 +144,8 @@ def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Rem
 def find_clock_jumps(sections: Sequence[Section]) -> Iterator[tuple[int, Finding]]:
     """Yield the first stamps [ns] after the clock of all sensors was set forward, and the findings.
 
-    Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive meanwhile.
+    Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive
+    meanwhile.
     """
     stamps = [sensor.stamp_ns for section in sections for sensor in section.measurements.sensors().values()]
     for epoch in dict.fromkeys(section.clock_epoch for section in sections):

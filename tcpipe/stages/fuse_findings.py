@@ -107,7 +107,7 @@ def _find_gate_resets(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
 
 
 def _find_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Finding]:
-    """Yield what explains contradictions of sensors, when, and by how much they were off; and the sections that need many changes."""
+    """Yield the explanations of contradictions, their times and sizes; and the sections that need many changes."""
     changes = (each for section in facts.stretches for each in section.changes if each.kind in CHANGES)
     for change in sorted(changes, key=lambda each: each.start_ns):
         names, span_s = {"change": CHANGES[change.kind].format(change.size)}, _find_span_s(change, first_ns)
@@ -161,7 +161,7 @@ def _find_span_s(each: StretchFacts | GateReset | ChangeFacts, first_ns: int) ->
 
 
 def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams: Streams) -> Iterator[Finding]:
-    """Yield where the longest track section shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
+    """Yield extrinsics and scales of the longest section that differ from the stated ones, with the recipe keys."""
     longest = facts.longest
     parameters = longest.parameters
     arm, tilt = parameters.get("antenna"), parameters.get("mounting of the IMU")
@@ -225,7 +225,7 @@ def _find_arm(arm: ParameterFacts, sensor: Sensor, turn: NDArray[np.float64]) ->
 
 
 def _find_tilt(tilt: ParameterFacts, sensor: Sensor) -> Finding:
-    """Return the finding of an IMU that is mounted otherwise: its measurements turn into the robot's axes by the inverse."""
+    """Return the finding of a rotated IMU: the inverse rotation turns its measurements into robot axes."""
     turn = matrix_from_quat(quat_from_rpy(*(-value for value in tilt.value))) @ matrix_from_quat(sensor.quat_xyzw)
     return make_finding(
         "imu-tilted",

@@ -46,10 +46,10 @@ from tcpipe.tables.levels import Sensor, Streams
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One clock epoch of a run, or a part of it without a pause of an hour, and everything that is decided about its sensors.
+    """A clock epoch of a run, or a part of it without a pause of an hour, and all decisions on its sensors.
 
-    Units and mounting are constants of the robot: a section also has those that sections with a longer drive show. Everything else is
-    decided in each section alone.
+    Units and mounting are constants of the robot: a section also has those that sections with a longer drive show.
+    Everything else is decided in each section alone.
 
     Attributes
     ----------
@@ -57,7 +57,8 @@ class Section:
     datum_deg_m : longitude, latitude, height of the local frame's origin; None without fixes.
     prepared : by role, messages that are not used as they are.
     excluded : by role, why a sensor is not fused.
-    clocks : time offsets of the sensors; ``measurements`` contain them until `tcpipe.stages.fuse_clocks.correct_clocks`.
+    clocks : time offsets of the sensors; ``measurements`` contain them until
+    `tcpipe.stages.fuse_clocks.correct_clocks`.
     cuts : by first stamp [ns] after the clock of all sensors was set forward, the finding.
     """
 
@@ -94,7 +95,7 @@ def rank_sections(sections: Sequence[Section]) -> list[int]:
 
 
 def prepare_sections(streams: Streams, config: FuseConfig) -> list[Section]:
-    """Return the measurements of each clock epoch, in order of epoch and time, without those that have no usable value."""
+    """Return the measurements of each clock epoch, in order of epoch and time, if they have a usable value."""
     tables = {role: streams.tables[role] for role in (GNSS, DOPPLER, IMU, WHEELS, VISUAL) if role in streams.tables}
     tables |= {GNSS: streams.tables[POSE]} if POSE in streams.tables else {}
     datum = None
@@ -200,8 +201,9 @@ def _prepare(
 def drop_implausible_sensors(sections: Sequence[Section], streams: Streams) -> list[Section]:
     """Return the sections without the sensors that cannot be right.
 
-    Sections are judged from the longest drive to the shortest. Each one decides about its own sensors, after it has taken over the
-    constants of the robot that those before it have shown: a few metres do not show the sign of a yaw rate.
+    Sections are judged from the longest drive to the shortest. Each one decides about its own sensors, after it has
+    taken over the constants of the robot that those before it have shown: a few metres do not show the sign of a yaw
+    rate.
     """
     stated = ("recipe", "tf_static", "same frame")
     is_imu_stated = IMU in streams.sensors and streams.sensors[IMU].placed_by in stated
@@ -238,7 +240,7 @@ def exclude_sensors(section: Section, exclusions: Iterable[SensorExclusion], str
 
 
 def _define_base_by_antenna(section: Section, streams: Streams) -> Section:
-    """Return a section with an antenna that nothing places exactly at base_link, if no other sensor of motion is fused."""
+    """Return a section with an antenna of unknown place near base_link, if no other sensor of motion is fused."""
     m = section.measurements
     if m.gnss is None or not m.is_antenna_alone or streams.sensors[GNSS].placed_by != "assumed":
         return section
@@ -248,7 +250,7 @@ def _define_base_by_antenna(section: Section, streams: Streams) -> Section:
 
 
 def _find_exclusion(exclusion: SensorExclusion, section: Section, streams: Streams) -> Finding:
-    """Return the finding of a sensor that is not fused; a receiver's velocity helps fixes that are fused, and no label needs it."""
+    """Return the finding of a sensor that is not fused; no label needs the velocity of a fused receiver."""
     sensor, name = streams.sensors[exclusion.role], exclusion.role
     if exclusion.units is not None:
         remedies = suggest("state_units", {"read": {"imu_units": exclusion.units}})

@@ -1,4 +1,4 @@
-"""Each section of a run from its start to its track: where it begins, filter and smoother, and what else is known at its stamps."""
+"""Each section of a run from its start to its track: start, filter and smoother, and further columns."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tcpipe.tables.levels import REJECTIONS, Streams
 
 @dataclass(slots=True)
 class Fused:
-    """Trajectory, facts and columns of every track section; time without a track [s]; whether the direction of one is assumed."""
+    """Trajectory, facts and columns of every section; time without track [s]; whether a direction is assumed."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
@@ -53,7 +53,7 @@ class Fused:
 
 
 def fuse_section(section: Section, streams: Streams, config: FuseConfig, last: Trajectory | None = None) -> Fused:
-    """Fuse each part of a section between pauses; a local frame goes on from the end of ``last``, the track before it."""
+    """Fuse each part of a section between pauses; a local frame continues from the end of ``last``, the last track."""
     fused = Fused()
     period_ns, max_gap_ns = round(1e9 / config.rate_hz), int(config.max_gap_s * 1e9)
     for part in cut_sections({section.clock_epoch: section.measurements}, tuple(section.cuts)):
@@ -94,12 +94,13 @@ def assume_forward(
 ) -> Trajectory:
     """Return the trajectory of a lone antenna at ``arm_m`` [m] in base_link with a robot that drives forward.
 
-    It drives backward where ``commanded_mps`` [m/s], shape (N,), NaN where unknown, is negative. A robot that the estimate drives the
-    other way is turned by half a turn about its z axis; the antenna keeps its place.
+    It drives backward where ``commanded_mps`` [m/s], shape (N,), NaN where unknown, is negative. A robot that the
+    estimate drives the other way is turned by half a turn about its z axis; the antenna keeps its place.
     """
     rotation, velocity = matrix_from_quat(found.quat_xyzw), found.velocity_enu_mps
     ahead_mps = np.sum(rotation[:, :, 0] * velocity, axis=1) * np.where(commanded_mps < 0.0, -1.0, 1.0)
-    # Rows up to the next change of sign are one drive; those below 0.2 m, which may be noise, keep the direction of the one before.
+    # Rows up to the next change of sign are one drive; those below 0.2 m, which may be noise, keep the direction of the
+    # one before.
     drive = np.cumsum(np.diff(np.sign(ahead_mps), prepend=0.0) != 0.0)
     driven_m = np.bincount(drive, np.abs(ahead_mps)) * compute_median_period_ns(found.stamp_ns) * 1e-9
     shown = np.flatnonzero(driven_m[drive] > 0.2)
@@ -187,7 +188,7 @@ def make_power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *
 
 
 def make_rejections_table(sections: Sequence[Section], found: Sequence[Trajectory], fixes: str = GNSS) -> pa.Table:
-    """Return every rejected measurement in order of time: by the gate, or without a usable value; ``fixes`` is the role of fixes."""
+    """Return all rejected measurements by time: by the gate, or unusable ones; ``fixes`` is the role of fixes."""
     parts = [trajectory.rejections for trajectory in found]
     invalid = [(role, each.invalid_ns) for section in sections for role, each in sorted(section.prepared.items())]
     size = sum(stamps.size for _, stamps in invalid)

@@ -203,7 +203,7 @@ def read_lonlat_deg(table: pa.Table, end: str) -> Floats:
 
 
 def read_ends_m(segments: pa.Table) -> tuple[Floats, Floats]:
-    """Return east and north of the start and of the end of segments in their own frames [m], null as NaN, shape (N, 2) each."""
+    """Return east and north of start and end of segments in their own frames [m], null as NaN, (N, 2) each."""
     return stack_floats(segments, "start_x_m", "start_y_m"), stack_floats(segments, "end_x_m", "end_y_m")
 
 

@@ -43,16 +43,13 @@ _PARABOLOID = np.linalg.pinv(
     _expand_square(*(np.mgrid[-_NEAR : _NEAR + 1, -_NEAR : _NEAR + 1].reshape(2, -1)[::-1] * _STEP_M))
 )
 _SPACING_M, _DRIFT_M, _CLIFF_M = 0.5, 25.0, 1.0
-"""Spacing of points [m]; path over which the track's heights have one error [m]; relief among near shifts that no robot
-drives on [m]."""
+"""Spacing of points; path of one error of the track's heights; relief among near shifts that no robot drives on [m]."""
 _FEWEST_POINTS, _MOST_POINTS = 60, 1_200
 """Fewest and most points of a track."""
 _BLOCKS, _DRAWS, _FEW_BLOCKS = 12, 200, 1.38
-"""Blocks of the path, draws of them, and variance factor for few blocks: 12 / 11 times the squared ratio of Student's t
-to normal."""
+"""Blocks of the path, draws of them, variance factor for few blocks: 12 / 11 times (Student's t / normal)²."""
 _SIGMAS, _OUTLIER, _EDGE_M = 5.0, 3.5, 0.75 * _STEP_M
-"""Least decrease of the misfit by a shift [σ]; least outlier [σ]; least step from the best inner shift beyond the edge
-[m]."""
+"""Least decrease of the misfit by a shift [σ]; least outlier [σ]; least step beyond the best inner shift [m]."""
 _CHI2_999 = 13.82
 """99.9 % of χ² with two degrees of freedom."""
 _LEAST_GAIN = -2.0 * np.log(0.9)
@@ -63,8 +60,7 @@ _UNITS |= {1.0 / metres: "m" for metres in _UNITS}
 """Unit of a map's heights by their scale; metres that were converted from another unit by mistake have its inverse."""
 _MAX_UNIT_ERROR = 0.07
 _KNOWN_SCALE, _EXPLAINED, _MAX_WRONG_STD, _MIN_WRONG_EXPLAINED = 0.03, 0.9, 0.1, 0.7
-"""Largest relative σ and least explained share of a scale to compare with 1; the same two for a scale that is surely
-wrong."""
+"""Largest relative σ and least explained share of a scale to compare with 1; the same of a surely wrong scale."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,10 +192,7 @@ def _sample_heights(level: MapReader, xy_m: Floats) -> Floats:
 
 
 def _find_ground(excess_m: Floats, xy_m: Floats) -> tuple[Mask, Mask]:
-    """Return the points on the map's ground at the best shift, (N,), and those of them that determine a shift.
-
-    These are not on cliffs, unless too few are left.
-    """
+    """Return the points on the map's ground at the best shift, (N,), and those (off cliffs) that determine a shift."""
     flat_m = excess_m - _fit_tilt(xy_m, excess_m[:, *_MIDDLE])[:, None, None]
     best = _find_least(np.median(np.abs(flat_m - np.median(flat_m, axis=0)), axis=0))
     for _ in range(6):

@@ -1,4 +1,4 @@
-"""Robot logs on disk: ROS 1 and ROS 2 bags, MCAP, tables and logs of autopilots, behind one face, `tcpipe.formats.logs.log_file`'s.
+"""Robot logs: ROS 1 and ROS 2 bags, MCAP, tables and autopilot logs, as `tcpipe.formats.logs.log_file` reads them.
 
 The way from a path to a table, each step importing only those below it::
 

@@ -1,7 +1,7 @@
 """Serialised messages of one topic to Arrow columns.
 
-`tcpipe.logs.wire_types` walks some thousand payloads at once. Those of equal length are gathered apart: most have one shape, and a
-field of all of them is a strided view. Only what a walk cannot do goes message by message.
+`tcpipe.logs.wire_types` walks some thousand payloads at once. Those of equal length are gathered apart: most have one
+shape, and a field of all of them is a strided view. Only what a walk cannot do goes message by message.
 """
 
 from __future__ import annotations
@@ -120,7 +120,8 @@ class TopicTable:
     def take(self, *, share: float = 1.0) -> pa.Table:
         """Return the messages held, sorted by log time (those of equal time in the order of the log), and forget them.
 
-        With a ``share`` below 1, about so much of them, the earlier ones: the rest stays, for what comes later but belongs before it.
+        With a ``share`` below 1, about so much of them, the earlier ones: the rest stays, for what comes later but
+        belongs before it.
         """
         self._flush()
         if not self._parts:
@@ -187,7 +188,7 @@ class TopicTable:
                 self._decode_lengths(rows[part], data, starts[part], ends[part], dialect)
 
     def _decode_lengths(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64, dialect: Dialect) -> None:
-        """Decode messages; many messages of equal length are decoded together, because each field of them is a strided view."""
+        """Decode messages; many of equal length are decoded together, since each of their fields is a strided view."""
         lengths = ends - starts
         if (lengths == lengths[0]).all():
             self._decode_dialect(rows, data, starts, ends, dialect)
@@ -300,7 +301,7 @@ def find_arrow_type(wire_type: WireType) -> pa.DataType:
 
 
 def make_texts(count: int, offsets: pa.Buffer, raw: pa.Buffer) -> tuple[pa.StringArray, int]:
-    """Return texts from Arrow's offsets and their bytes, and how many are no UTF-8: what is no character is replaced."""
+    """Return texts from Arrow's offsets and bytes, and the number of invalid UTF-8 texts; bad bytes are replaced."""
     found = pa.StringArray.from_buffers(count, offsets, raw)
     if not (np.frombuffer(raw, np.uint8) & 0x80).any():
         return found, 0
@@ -367,7 +368,8 @@ class WalkedColumns:
     def _compact(self, runs: Runs) -> tuple[pa.Buffer, pa.Buffer]:
         """Copy runs together; return Arrow's offsets and the bytes.
 
-        As runs rise, their bounds are those of an Arrow array in which every other element is a gap: `take` leaves the gaps out.
+        As runs rise, their bounds are those of an Arrow array in which every other element is a gap: `take` leaves the
+        gaps out.
         """
         count = len(runs.lengths)
         if isinstance(runs.places, Grid):

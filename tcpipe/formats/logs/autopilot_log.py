@@ -1,6 +1,7 @@
-"""An autopilot's log behind the face of a log: each message name is a topic with its own fields, and what roles can use a topic beside it.
+"""Autopilot logs by the interface of a log: each message name is a topic; and the topics that roles can use.
 
-``/sensor_combined`` has PX4's own fields, which the recipe can map; ``/sensor_combined/imu`` has them as sensor_msgs/Imu.
+``/sensor_combined`` has PX4's own fields, which the recipe can map; ``/sensor_combined/imu`` has them as
+sensor_msgs/Imu.
 """
 
 from __future__ import annotations
@@ -45,14 +46,14 @@ _STRAY_US, _LATE_US = 1_000_000, 3_600 * 10**6
 _WINDOW = 5
 """Messages in a row by whose median a stray stamp is found."""
 _MOST_DIGITS, _DEEPEST = 5, 5
-"""Largest number of digits of a list's length, and of levels of formats inside formats [1]; a format with more is damaged."""
+"""Most digits of a list's length, and most levels of nested formats [1]; a format with more is damaged."""
 
 Layout = np.dtype[np.void]
 
 
 @dataclass(slots=True)
 class AutopilotMessages:
-    """Messages of one name and instance, in order of time since boot [µs], with the offsets in the file at which their fields begin.
+    """Messages of one name and instance, by time since boot [µs], with the offsets in the file of their fields.
 
     ``scales`` are by field: what one of a whole number is in the field's unit.
     """
@@ -81,12 +82,12 @@ def _gather_field(data: bytes, offsets: Ints, layout: Layout, name: str) -> Ints
 
 
 _CLOCKS = {"timestamp": 1, "TimeUS": 1, "T": 1000, "TimeMS": 1000}
-"""Unit of a time field [µs], by name; ArduPilot wrote milliseconds before 2015, TimeMS of a GPS since the begin of the week."""
+"""Unit of a time field [µs], by name; ArduPilot wrote milliseconds before 2015; a GPS's TimeMS is that of the week."""
 
 
 @dataclass(slots=True)
 class AutopilotRecords:
-    """Content of a log: messages by name (names of further instances end in ``_1`` …), parameters, damage, and lost messages.
+    """Content of a log: messages by name (further instances end in ``_1`` …), parameters, damage, and lost messages.
 
     ``dropouts`` counts how often the logger could not keep up.
     """
@@ -133,7 +134,7 @@ class AutopilotRecords:
         )
 
     def sort_by_time(self) -> None:
-        """Bring messages in order of time; those with a stamp far from those around it, or from the log's end, are left out and counted."""
+        """Sort messages by time; those with a stamp far from their neighbours or the log's end are dropped, counted."""
         ends = [
             float(np.median(message.time_us[-_WINDOW:]))
             for message in self.messages.values()
@@ -163,7 +164,7 @@ def _find_stray(time_us: Ints) -> Mask:
 
 
 def read_autopilot_records(path: Path, kind: AutopilotKind) -> AutopilotRecords:
-    """Return what a ``ulog`` or ``dataflash`` log holds; `LogError` where it cannot be read, or was made to take all memory."""
+    """Return the content of a ``ulog`` or ``dataflash`` log; `LogError` if it is unreadable or would exhaust memory."""
     try:
         records = AutopilotRecords(path, path.read_bytes())
     except OSError as error:
@@ -191,7 +192,7 @@ _DATA = ord("D")
 
 
 def _parse_field(text: str) -> tuple[str, int, str] | None:
-    """Return the type of a field, how many of it there are (0: no list) and its name, from ``float[3] rate``; None where it is no field."""
+    """Return type, count (0: no list) and name of a field such as ``float[3] rate``; None if it is no field."""
     type_name, _, name = text.partition(" ")
     kind, opening, count = type_name.removesuffix("]").partition("[")
     number = int(count) if count.isdecimal() and len(count) <= _MOST_DIGITS else 0
@@ -201,7 +202,7 @@ def _parse_field(text: str) -> tuple[str, int, str] | None:
 
 @dataclass(slots=True)
 class _UlogTopic:
-    """A subscription: messages of a format; their sizes [byte] with and without what pads them, and where their fields lie."""
+    """A subscription: messages of a format, their sizes [byte] with and without padding, and their fields' offsets."""
 
     name: str
     instance: int
@@ -304,7 +305,7 @@ class _UlogReader:
         self._by_id[number] = self._topics.setdefault((name, instance), _UlogTopic(name, instance, *layout))
 
     def _make_layout(self, name: str) -> tuple[Layout, int] | str:
-        """Return the layout of messages of a format and their size with padding [byte], or the reason why they are unknown."""
+        """Return the layout of messages of a format and their padded size [byte], or the reason why it is unknown."""
         fields: list[tuple[str, DTypeLike]] = []
         size = 0
         try:
@@ -390,7 +391,7 @@ def _read_dataflash(records: AutopilotRecords) -> None:
 
 
 def _find_message(data: bytes, start: int, lengths: list[int]) -> int:
-    """Return the offset of the next message that precedes another one or the end of the file; the size of the file without one."""
+    """Return the offset of the next message that precedes another or the file's end; without one the file's size."""
     at = data.find(_HEAD, start)
     while at >= 0 and at + 2 < len(data):
         end = at + lengths[data[at + 2]]
@@ -403,7 +404,7 @@ def _find_message(data: bytes, start: int, lengths: list[int]) -> int:
 def _define_format(
     data: bytes, at: int, lengths: list[int], formats: dict[int, tuple[str, Layout, dict[str, float]]]
 ) -> None:
-    """Read a format; the first of a number holds, and of one that contradicts itself only the length of its messages."""
+    """Read a format; the first of a number counts; of a contradictory one only the length of its messages is used."""
     kind, length, name, letters, labels = struct.unpack_from("<BB4s16s64s", data, at)
     codes = [_DATAFLASH_TYPES.get(letter) for letter in letters.rstrip(b"\0").decode("latin-1")]
     given = [*labels.rstrip(b"\0").decode("ascii", "replace").split(","), *[""] * len(codes)]
@@ -475,7 +476,7 @@ def _find_base(name: str) -> str:
 
 
 def _make_stamped(messages: RoleMessages, stamp_ns: Ints, lever_arms: LeverArms) -> Fields:
-    """Return a message's fields with stamp and frame; what its values are given in is base_link where nothing places an IMU."""
+    """Return a message's fields with stamp and frame; its values are in base_link if no transform places an IMU."""
     frame = "base_link" if messages.frame == "imu" and messages.frame not in lever_arms else messages.frame
     column = "child_frame_id" if messages.type_name == ODOMETRY else "header.frame_id"
     return {**make_stamp_fields(stamp_ns), **messages.columns, column: pa.repeat(frame, len(stamp_ns))}

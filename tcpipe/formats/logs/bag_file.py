@@ -1,8 +1,8 @@
-"""ROS 1 bags, version 2.0 (http://wiki.ros.org/Bags/Format/2.0): by their index, or record by record where it is missing or broken.
+"""ROS 1 bags, version 2.0 (http://wiki.ros.org/Bags/Format/2.0), read by their index or, without one, by records.
 
-A record is a header (fields ``name=value``) and data, each after its length (uint32). Chunks hold connections and messages; after a
-chunk stands an index record for each of its connections; the file ends with all connections and a summary of every chunk.
-A bag carries no checksum of its own: bz2 has one, lz4 and plain chunks have none.
+A record is a header (fields ``name=value``) and data, each after its length (uint32). Chunks hold connections and
+messages; after a chunk stands an index record for each of its connections; the file ends with all connections and a
+summary of every chunk. A bag carries no checksum of its own: bz2 has one, lz4 and plain chunks have none.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def stamp_ns(fields: dict[bytes, bytes], name: bytes) -> int:
 
 
 def read_indexed_messages(found: Excerpt) -> tuple[Messages, Mask]:
-    """Return the messages of an excerpt, and at which of its entries there is one of that connection and time that ends before the next.
+    """Return the messages of an excerpt, and which of its entries are a message of that connection and time.
 
     Headers of messages agree but for connection and time, so the first is parsed and the others compared to it.
     """
@@ -185,7 +185,7 @@ def read_indexed_messages(found: Excerpt) -> tuple[Messages, Mask]:
 
 
 def _find_message_fields(header: bytes) -> tuple[int, int]:
-    """Return the offsets of connection and time in the record of a message; zeros if the header is not that of a message."""
+    """Return the offsets of connection and time in a message record; zeros if its header is not that of a message."""
     try:
         fields = parse_header_fields(header)
     except DamageError:
@@ -211,7 +211,8 @@ _EXPECTED_BYTES = 1 << 24
 class _Chunk:
     """A chunk, and how many messages of each connection it contains; ``counts`` is None if only its records show them.
 
-    ``record`` is the record at ``offset`` (None before it is read, or if it is damaged), ``size`` that of its records [byte].
+    ``record`` is the record at ``offset`` (None before it is read, or if it is damaged), ``size`` that of its records
+    [byte].
     """
 
     offset: int
@@ -255,7 +256,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return {number: _make_topic(self._connections[number]) for number in sorted(self._connections)}
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, _Chunk]]:
-        """Return the chunks that may hold wanted connections, each with the number of bytes in all chunks before it, at most."""
+        """Return the chunks that may hold wanted connections, each with the most bytes in all chunks before it."""
         found, sizes = [], []
         for first in range(0, len(self._chunks), _PLACED_AT_ONCE):
             chunks = self._chunks[first : first + _PLACED_AT_ONCE]
@@ -344,7 +345,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return (np.repeat(chunk_number, counts), np.repeat(connections, counts), words[:, 2], stamps_ns), unsound
 
     def _index_of(self, chunk: _Chunk) -> list[tuple[int, bytes]]:
-        """Return each connection's entries in the index behind a chunk; `DamageError` where it has none, or a broken one."""
+        """Return each connection's entries in the index behind a chunk; `DamageError` if it is missing or damaged."""
         counts = chunk.counts
         if counts is None or chunk.cut or chunk.record is None:
             raise DamageError("chunk-index-damaged")
@@ -499,7 +500,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return self._bytes.size
 
     def _chunk_of_mark(self, mark: int, start: int) -> int | None:
-        """Return where, at ``start`` or behind, the chunk's record begins whose header has the mark at byte ``mark``."""
+        """Return the first record, at ``start`` or later, of a chunk whose header has the mark at byte ``mark``."""
         first = max(mark - _MAX_CHUNK_HEADER, start)
         try:
             before = bytes(self._bytes.read(first, mark - first))
@@ -548,7 +549,7 @@ class BagPart(ChunkedPart[_Chunk]):
 
 
 def _find_needed_bytes(offset: int, record: BagRecord) -> tuple[int, int]:
-    """Return which bytes (offset, size) are read of a chunk that holds something wanted: of a plain one, its indexes to begin with."""
+    """Return the bytes (offset, size) to read of a chunk with wanted messages; of a plain chunk, first its indexes."""
     return (
         (record.end, _INDEX_HEAD_BYTES) if record.codec == "none" else (offset, record.end + _INDEX_HEAD_BYTES - offset)
     )

@@ -1,7 +1,8 @@
-"""How the chunks of a log are read, whatever its format: by their index as far as the chunks bear it out, else record by record.
+"""Read the chunks of a log of any format, by their index where the chunks agree with it, else record by record.
 
-In a log with cameras most bytes of a chunk are not wanted. What is wanted of several such chunks is laid together, and looked at once
-for all of them: what a look costs, however short, is paid once for thousands of messages instead of for each chunk.
+In a log with cameras most bytes of a chunk are not wanted. What is wanted of several such chunks is laid together, and
+looked at once for all of them: what a look costs, however short, is paid once for thousands of messages instead of for
+each chunk.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ Piece = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Entries:
-    """Where messages lie, by the index: of each its chunk's number in the group, its channel, offset and log time, shape (N,) each.
+    """Places of messages by the index: chunk number in the group, channel, offset and log time, shape (N,) each.
 
     They rise by chunk and offset. ``end`` is where in the chunk the next message begins, or the chunk ends.
     """
@@ -52,7 +53,7 @@ class Entries:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Chunks to read at once: their numbers in the group, and the wanted messages (None: only the chunk's records show them).
+    """Chunks to read together: their numbers in the group, and the wanted messages (None: only the records show them).
 
     A ``compact`` one keeps only the pieces with wanted messages; others are single chunks, kept whole.
     """
@@ -77,7 +78,7 @@ class Excerpt:
 
 @dataclass(frozen=True, slots=True)
 class Messages:
-    """Messages in ``data``: where the record of each and its payload begin, how long that is, and its times, shape (N,) each."""
+    """Messages in ``data``: offsets of their records and payloads, payload lengths, and times, shape (N,) each."""
 
     data: memoryview
     channel: Ints
@@ -167,22 +168,23 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
 
     @abstractmethod
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, AnyChunk]]:
-        """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it, at most."""
+        """Return the chunks that may hold wanted channels, each with the most bytes in all chunks before it."""
 
     @abstractmethod
     def read_indexes(self, chunks: list[AnyChunk]) -> tuple[tuple[Ints, ...], Sequence[int]]:
         """Return the messages of chunks by their indexes, and which chunks have no sound one.
 
-        Of each message that is its chunk's number in the list, its channel, offset in the chunk and log time, shape (N,) each.
+        Of each message that is its chunk's number in the list, its channel, offset in the chunk and log time, shape
+        (N,) each.
         """
 
     @abstractmethod
     def load(self, chunk: AnyChunk) -> memoryview:
-        """Return all records of a chunk, valid until the next read; of one that the file's end cuts, what can still be had."""
+        """Return all records of a chunk, valid until the next read; of a chunk cut by the file's end, what remains."""
 
     @abstractmethod
     def find_plain_data(self, chunk: AnyChunk) -> int | None:
-        """Return where in the file the records of a chunk begin, of which pieces can be read; None where it must be loaded."""
+        """Return the file offset of a chunk's records if pieces of them can be read; None if all must be loaded."""
 
     @abstractmethod
     def read_indexed(self, found: Excerpt) -> tuple[Messages, Mask]:
@@ -194,7 +196,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
 
     @abstractmethod
     def is_proved(self, chunk: AnyChunk) -> bool:
-        """Tell whether a checksum covers the chunk's records, so that it is the index that is wrong where they differ."""
+        """Return whether a checksum covers the chunk's records, so that the index is wrong if they differ."""
 
     @abstractmethod
     def needs_index(self, chunk: AnyChunk) -> bool:
@@ -205,7 +207,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         """Note the damage of a chunk that is lost as a whole, counted by the index."""
 
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
+        """Yield the messages of the wanted channels by chunk, or by several chunks if few messages are wanted."""
         chunks = self.chunks_with(wanted)
         for group in group_chunks(chunk.size for _, chunk in chunks):
             members = chunks[group.start : group.stop]
@@ -215,7 +217,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
                 yield from self._read_span_blocks(span, members, wanted)
 
     def entries(self, chunks: list[AnyChunk], sizes: Ints) -> tuple[Entries, Mask]:
-        """Return the messages of chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
+        """Return the messages of chunks of ``sizes`` bytes by their indexes, and which chunks have a valid index."""
         (chunk, channel, offset, log_time_ns), unsound = self.read_indexes(chunks)
         entries, sound = sort_by_place(chunk, channel, offset, log_time_ns, sizes, least_bytes=self.least_bytes)
         sound[unsound] = False
@@ -331,7 +333,8 @@ def sort_by_place(
 def plan_chunk_spans(entries: Entries, sizes: Ints, sound: Mask, wanted: Sequence[int]) -> Iterator[Span]:
     """Yield, in order, how to read the chunks of a group: those of which little is wanted together, others one by one.
 
-    ``entries`` are the messages of those whose index is sound; ``sizes`` [byte] and ``sound`` are of all chunks, shape (M,).
+    ``entries`` are the messages of those whose index is sound; ``sizes`` [byte] and ``sound`` are of all chunks, shape
+    (M,).
     """
     entries = entries.at(np.isin(entries.channel, wanted))
     wanted_bytes = np.bincount(entries.chunk, entries.end - entries.offset, len(sizes))
@@ -350,7 +353,8 @@ def plan_chunk_spans(entries: Entries, sizes: Ints, sound: Mask, wanted: Sequenc
 def lay_out_pieces(entries: Entries) -> tuple[dict[int, list[Piece]], Ints, int]:
     """Return how the pieces of chunks that hold messages are laid one after the other.
 
-    That is the pieces of each chunk by its number; where each message then begins, in the order of the entries; and the bytes in all.
+    That is the pieces of each chunk by its number; where each message then begins, in the order of the entries; and the
+    bytes in all.
     """
     begins = np.ones(len(entries.offset), np.bool_)
     far = entries.offset[1:] - entries.end[:-1] > _GAP_BYTES

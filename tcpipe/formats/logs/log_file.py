@@ -73,10 +73,11 @@ _KNOWN_MAGIC = (
 
 
 def open_log(path: Location, *, message_definitions: Path | None = None) -> Log:
-    """Open a .mcap, .bag or .db3 file (by its content, not its name), or a ROS 2 bag directory; `LogError` names any other kind.
+    """Open a .mcap, .bag or .db3 file (by its content), or a ROS 2 bag directory; `LogError` names any other kind.
 
-    ``path`` may be the URL of one (``s3://…``): of an .mcap or .bag with an index only the requested topics are fetched, any other is
-    copied until the log is closed. ``message_definitions``: a directory of .msg files for types that the log does not define.
+    ``path`` may be the URL of one (``s3://…``): of an .mcap or .bag with an index only the requested topics are
+    fetched, any other is copied until the log is closed. ``message_definitions``: a directory of .msg files for types
+    that the log does not define.
     """
     with ExitStack() as stack:
         stored: dict[Path, StoredObject] = {}
@@ -170,7 +171,7 @@ def _refuse_what_is_not_there(path: Path) -> None:
 
 
 def find_logs(path: Path) -> list[Path]:
-    """Return the logs at or below a path, by name, and directories that cannot be read; hidden files are skipped. `LogError`: no log."""
+    """Return logs at or below a path by name, without hidden files, and unreadable directories. `LogError`: none."""
     path = Path(path)
     _refuse_what_is_not_there(path)
     if not path.is_dir():
@@ -182,7 +183,7 @@ def find_logs(path: Path) -> list[Path]:
 
 
 def list_logs_below(directory: Path) -> list[Path]:
-    """Return the logs in a directory as `find_logs`, which may be none; a directory is read once, even if several links lead to it."""
+    """Return the logs in a directory as `find_logs` does, perhaps none; linked directories are read once."""
     found, seen, waiting = list[Path](), set[tuple[int, int]](), [(directory, True)]
     while waiting:
         path, is_directory = waiting.pop()
@@ -199,7 +200,7 @@ def list_logs_below(directory: Path) -> list[Path]:
 
 
 def hash_files(files: Iterable[Path], size_bytes: int) -> str:
-    """Return the SHA-256 of files, one after the other, which have ``size_bytes`` together. `LogError`: the disk fails."""
+    """Return the SHA-256 of concatenated files of ``size_bytes`` in total. `LogError`: the disk fails."""
     digest, meter = hashlib.sha256(), Meter("hashing", size_bytes)
     for file in files:
         try:
@@ -293,7 +294,7 @@ class Log(OpenLog):
 
     @property
     def outline(self) -> str:
-        """A hash (hex) of the sizes and indexes of all files, the same wherever they lie; "" where a file has no index."""
+        """Return a hash (hex) of the sizes and indexes of all files, independent of place; "" without an index."""
         outlines = [part.outline for part in self._parts]
         if not all(outlines) or len(outlines) < len(self.files):
             return ""
@@ -307,7 +308,8 @@ class Log(OpenLog):
     def sha256(self) -> str:
         """Return the SHA-256 of the file; of a bag directory, of its storage files one after the other, by name.
 
-        Of a log in object storage that is read by its index it is that of the index, the `outline`. `LogError`: the disk fails.
+        Of a log in object storage that is read by its index it is that of the index, the `outline`. `LogError`: the
+        disk fails.
         """
         if self.is_known_by_outline:
             return self.outline
@@ -316,7 +318,7 @@ class Log(OpenLog):
         return hash_files(sorted(self.files, key=lambda file: file.name), self.size_bytes)
 
     def definition(self, topic: str) -> tuple[str, str]:
-        """Return the text of a topic's message definition, and where it is from: ``log``, or ``given`` or ``bundled`` in its stead.
+        """Return a topic's message definition and its source: ``log``, or else ``given`` or ``bundled``.
 
         Both are empty where the type is not known.
         """
@@ -340,8 +342,9 @@ class Log(OpenLog):
     def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
         """Return the tables of several topics, read in one pass.
 
-        A table has one row a message in the order of log time: ``log_time_ns``, ``publish_time_ns``, then the fields by dotted name.
-        A topic that cannot be decoded is missing and named in `findings`. `LogError`: a topic is not in the log.
+        A table has one row a message in the order of log time: ``log_time_ns``, ``publish_time_ns``, then the fields by
+        dotted name. A topic that cannot be decoded is missing and named in `findings`. `LogError`: a topic is not in
+        the log.
         """
         (tables,) = self.batches(topics, batch_bytes=None)
         return tables
@@ -360,9 +363,10 @@ class Log(OpenLog):
     def batches(self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES) -> Iterator[dict[str, pa.Table]]:
         """Yield the tables of several topics piece by piece, as `tables`, in memory that does not grow with the log.
 
-        Each dict has the next rows of some topics (those with most rows); the last one names every topic. Rows are in the order of log
-        time, also from piece to piece, unless a message is in the log more than half a piece behind its time; `findings` counts those. A
-        piece is yielded when more than ``batch_bytes`` are gathered over all topics; None yields everything at once.
+        Each dict has the next rows of some topics (those with most rows); the last one names every topic. Rows are in
+        the order of log time, also from piece to piece, unless a message is in the log more than half a piece behind
+        its time; `findings` counts those. A piece is yielded when more than ``batch_bytes`` are gathered over all
+        topics; None yields everything at once.
         """
         collected = self._collectors(topics)
         most = math.inf if batch_bytes is None else batch_bytes
@@ -412,7 +416,7 @@ class Log(OpenLog):
         return {name: TopicTable(message_type, self.topics[name].encoding) for name, message_type in types.items()}
 
     def _blocks(self, index: int, collected: Mapping[str, TopicTable]) -> Iterator[tuple[TopicTable, MessageBlock]]:
-        """Yield one file's blocks, each with its topic's table; channels that differ from their topic's type are set aside."""
+        """Yield one file's blocks, each with its topic's table, without channels of another type than their topic's."""
         part, channels = self._parts[index], {}
         for number, channel in part.channels.items():
             if channel.name in collected:
@@ -520,7 +524,7 @@ def _allow_files(count: int) -> None:
 
 
 def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
-    """Return possible logs in a directory, each with whether it is a directory to search; a bag directory returns itself."""
+    """Return possible logs in a directory, and whether each is a directory to search; a bag directory gives itself."""
     with os.scandir(directory) as there:
         entries = sorted(there, key=lambda entry: entry.name)
     one_bag = is_one_bag(directory)

@@ -1,7 +1,8 @@
 """Several files of one drive read as one log: parts of a ROS 1 split, or power in a file of its own.
 
-`rosbag record --split` writes ``drive_0.bag``, ``drive_1.bag``, … (often with a time before the number), and static transforms only into
-the part in which they came: a later part that is read alone takes them from the nearest earlier part in its folder.
+`rosbag record --split` writes ``drive_0.bag``, ``drive_1.bag``, … (often with a time before the number), and static
+transforms only into the part in which they came: a later part that is read alone takes them from the nearest earlier
+part in its folder.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _GAP_NS = 5_000_000_000
 
 
 class JoinedLog(OpenLog):
-    """Several logs with the interface of one: topics merged, tables in log-time order, static transforms of an ``earlier`` part."""
+    """Several logs by the interface of one: merged topics, tables in log-time order, static transforms of the first."""
 
     def __init__(
         self, logs: Sequence[Log | TableLog], earlier: Log | None, topics: Mapping[str, Topic], stack: ExitStack
@@ -127,7 +128,7 @@ AnyLog: TypeAlias = "Log | JoinedLog | TableLog"
 def open_logs(
     paths: Sequence[Location], *, message_definitions: Path | None = None, tables: Mappings | None = None
 ) -> AnyLog:
-    """Open one log as `open_single_log`, or several as one; `LogError` when a topic has different types in two of them."""
+    """Open one log as `open_single_log`, or several as one; `LogError` if a topic's types differ between them."""
     firsts: dict[tuple[Location, ...], Location] = {}
     for path in sorted(paths, key=Path):
         run = find_table_run(path, tables or {})

@@ -1,6 +1,7 @@
 """Interface of every log container: channels, and blocks of serialised messages with their times.
 
-A `LogPart` is one file of a log. `tcpipe.formats.logs.log_file` joins the parts of a log and turns their blocks into tables.
+A `LogPart` is one file of a log. `tcpipe.formats.logs.log_file` joins the parts of a log and turns their blocks into
+tables.
 """
 
 from __future__ import annotations
@@ -25,16 +26,17 @@ from tcpipe.formats.object_storage import StoredObject
 from tcpipe.logs.topics import Damage, Topic
 
 MAX_CHUNK_BYTES = 1 << 29
-"""A chunk that claims to hold more than this is taken for damaged: it is held as a whole. Writers make chunks of some megabytes."""
+"""Largest plausible content of a chunk, which is held as a whole [byte]; writers make chunks of some megabytes."""
 _PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO, _PLAUSIBLE_CHUNK_RATIO = 1 << 26, 1000, 100
-"""Limits of decompressed data: size [byte] and ratio to the compressed size. Data that claim to exceed both are damaged (a bomb). The limit
-of a chunk or message is lower than that of a file, because it is in memory as a whole, and more than once while it is decoded."""
+"""Limits of decompressed data: size [byte] and ratio to the compressed size. Data that claim to exceed both are damaged
+(a bomb). The limit of a chunk or message is lower than that of a file, because it is in memory as a whole, and more
+than once while it is decoded."""
 MAX_CHUNKS = 1 << 20
 """A file of more chunks is refused: of chunks of a megabyte, as writers make them, this is a terabyte."""
 MAX_CHANNELS = 1 << 16
 """More channels or connections of a file are refused: MCAP cannot number more."""
 _FEW_RECORDS, _LEAST_RECORD_BYTES = 1 << 20, 4
-"""A file that holds more records than the first, and than one for so many of its bytes, is a bomb: a message alone has two times."""
+"""A file with more records than the first, and than one per so many bytes, is hostile: a message has two times."""
 _PLAUSIBLE_TOTAL = 1 << 30
 _SEARCH_BYTES = 1 << 20
 
@@ -73,7 +75,7 @@ class MessageBlock:
 
 
 def group_by_key(keys: Ints) -> Iterator[tuple[int, Ints]]:
-    """Yield each key, rising, and where it stands, shape (M,) each: at the cost of one sort, however many keys there are."""
+    """Yield each key, rising, and its positions, shape (M,) each, by one sort."""
     order = np.argsort(keys, kind="stable")
     starts = np.flatnonzero(np.diff(keys[order], prepend=keys[order[:1]] - 1))
     for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(order)], strict=False):
@@ -175,7 +177,7 @@ def _find_runs(numbers: Sequence[int]) -> list[range]:
 
 
 class ByteSource:
-    """A file read by position; with ``fetched``, one in object storage, for which the path is a stand-in until all of it is here."""
+    """A file read by position; with ``fetched``, one in object storage, whose path is a placeholder until complete."""
 
     def __init__(self, path: Path, fetched: FetchedFile | None = None) -> None:
         self._file, self._fetched = path.open("rb"), fetched
@@ -196,7 +198,7 @@ class ByteSource:
         return memoryview(data)
 
     def read_once(self, offset: int, size: int) -> memoryview:
-        """Return bytes as `read` does, valid only until the next call: their memory, still in the cache, is used again."""
+        """Return bytes as `read` does, valid until the next call, which reuses their memory (still in the cache)."""
         if size < 0 or offset + size > self.size:
             raise DamageError("file-cut")
         if len(self._scratch) < size:
@@ -213,7 +215,7 @@ class ByteSource:
                 view[:] = self.read(offset, len(view))
 
     def peek(self, offset: int, size: int) -> bytes:
-        """Return up to ``size`` bytes at ``offset`` (fewer at the end); cheap for many small, mostly ascending reads."""
+        """Return up to ``size`` bytes at ``offset`` (fewer at the end); fast for many small, mostly ascending reads."""
         at, held = self._peeked
         if offset < at or offset + size > at + len(held):
             at, held = self._peeked = offset, self._some(offset, max(size, _PEEK_BYTES))
@@ -222,9 +224,10 @@ class ByteSource:
         return held[offset - at : offset - at + size]
 
     def windows(self, start: int, end: int, overlap: int) -> Iterator[tuple[int, int, memoryview]]:
-        """Yield (start, size to search, bytes) of pieces to search one after the other; what cannot be read is left out.
+        """Yield (start, size to search, bytes) of pieces to search one after the other; unreadable bytes are left out.
 
-        The first are small: a search that succeeds soon stays cheap, however many there are in a file that is made to need them.
+        The first are small: a search that succeeds soon stays cheap, however many there are in a file that is made to
+        need them.
         """
         size = 1 << 12
         while start < end:
@@ -278,18 +281,18 @@ class ByteSource:
 
 
 def outline_of(size: int, index: bytes | memoryview) -> str:
-    """Return a hash (hex) of a file's size [byte] and its index, which holds where its chunks lie and when they were recorded."""
+    """Return a hash (hex) of a file's size [byte] and its index, which has the places and times of its chunks."""
     return hashlib.sha256(size.to_bytes(8, "little") + bytes(index)).hexdigest()
 
 
 def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:
-    """Return whether compressed bytes claim to hold implausibly much; ``whole``: what would be held in memory as a whole."""
+    """Return whether compressed bytes claim an implausible size; ``whole``: the size to be held in memory at once."""
     ratio = _PLAUSIBLE_CHUNK_RATIO if whole else _PLAUSIBLE_RATIO
     return size > _PLAUSIBLE_BYTES and size > ratio * compressed_bytes
 
 
 class Bounds:
-    """Limit of the content of one file by its size [byte]: `LogError` above it, since such a file was made to use all memory or time."""
+    """Limit of a file's content by its size [byte]: `LogError` above it, since it would exhaust memory or time."""
 
     def __init__(self, path: Path, size: int) -> None:
         self._path, self._size = path, size
@@ -350,7 +353,8 @@ def _refuse_unknown(codec: str) -> None:
 def _read_lz4_content_size(frame: memoryview) -> int:
     """Return what an LZ4 frame says of its content's size, which decompressing proves; -1 where it says nothing.
 
-    Without either this or a checksum, what a frame lacks of the size that a chunk claims would be whatever lay in memory before.
+    Without either this or a checksum, what a frame lacks of the size that a chunk claims would be whatever lay in
+    memory before.
     """
     if len(frame) < _LZ4_HEAD.size or frame[:4] != _LZ4_MAGIC or not frame[4] & _LZ4_HAS_CONTENT_SIZE:
         return -1
@@ -371,10 +375,10 @@ def decompress_prefix(codec: str, data: memoryview, size: int) -> memoryview:
 
 
 def gather_integers(buffer: bytes | memoryview, offsets: Ints, code: str) -> Ints:
-    """Return the little-endian integers (numpy's ``code``: ``u2``, ``u4``, ``i8``) that lie at ``offsets``, of any alignment.
+    """Return the little-endian integers (numpy's ``code``: ``u2``, ``u4``, ``i8``) at ``offsets``, of any alignment.
 
-    The caller has checked the bounds. Unsigned 64-bit values are read as ``i8``: no length or time in a log reaches the sign bit, and
-    one that claims to is negative, which every check refuses.
+    The caller has checked the bounds. Unsigned 64-bit values are read as ``i8``: no length or time in a log reaches the
+    sign bit, and one that claims to is negative, which every check refuses.
     """
     kind = np.dtype("<" + code)
     windows: NDArray[np.generic] = np.ndarray((len(buffer) - kind.itemsize + 1,), kind, buffer, 0, (1,))

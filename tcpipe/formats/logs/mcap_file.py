@@ -1,7 +1,7 @@
 """MCAP files: by their summary where it can be trusted, record by record where not, and past what is broken.
 
-A chunk is decompressed only when it holds a wanted channel, its CRC is checked, and the message index beside it (which no checksum
-covers) is believed only as far as the chunk's own records bear it out.
+A chunk is decompressed only when it holds a wanted channel, its CRC is checked, and the message index beside it (which
+no checksum covers) is believed only as far as the chunk's own records bear it out.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class McapPart(ChunkedPart[Chunk]):
         return records, end
 
     def read_walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
-        """Return the wanted messages of a chunk by its records; note damage if these end too early or cannot be parsed."""
+        """Return the wanted messages of a chunk by its records; note damage if these end too early or are invalid."""
         records, end = self._step_through(chunk, data)
         messages, _ = read_messages_at(data, find_message_offsets(data, records))
         every = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
@@ -183,7 +183,7 @@ class McapPart(ChunkedPart[Chunk]):
                     self._note("chunk-suspect", chunk.offset)
 
     def _note_odd_ones_without_crc(self) -> None:
-        """Note the chunks that were read without a CRC where others of the file have one: it may have been overwritten."""
+        """Note the chunks that were read without a CRC if other chunks of the file have one: it may be overwritten."""
         odd = [chunk for chunk in self._contents.chunks if chunk.offset in self._without_crc and not chunk.headless]
         others = [chunk for chunk in self._contents.chunks if chunk.offset not in self._without_crc] if odd else []
         if any(self._any_crc(others[first : first + _AT_ONCE]) for first in range(0, len(others), _AT_ONCE)):
@@ -269,7 +269,7 @@ class McapPart(ChunkedPart[Chunk]):
         self._note_odd_messages()
 
     def _check_data_section(self, contents: Contents, end: int) -> None:
-        """Compare the CRC of all data, where there is one, if messages lie outside chunks: nothing else covers these."""
+        """Compare the CRC of all data, if there is one, when messages are outside chunks: nothing else covers these."""
         crc = int.from_bytes(self._bytes.peek(end + RECORD_HEAD, 4), "little")
         if not crc or not any(chunk.headless for chunk in contents.chunks):
             return
@@ -280,7 +280,7 @@ class McapPart(ChunkedPart[Chunk]):
             self._note("chunk-damaged", end)
 
     def _walk(self, contents: Contents, start: int, end: int) -> bool:
-        """Step from record to record; after a damaged one, search for the next chunk. Return whether the end of the data was reached."""
+        """Step through the records; after a damaged one, search the next chunk. Return whether the end was reached."""
         position = start
         while position + RECORD_HEAD <= end:
             if (after := self._take_loose_messages(contents, position, end)) > position:
@@ -383,7 +383,7 @@ class McapPart(ChunkedPart[Chunk]):
         return end
 
     def _count_messages(self) -> None:
-        """Count the messages of a walked file by its message indexes; load what has none, or what may declare unknown channels."""
+        """Count the messages of a walked file by its indexes; load chunks without one or with undeclared channels."""
         contents = self._contents
         for chunk in contents.chunks:
             if chunk.headless:
@@ -456,7 +456,7 @@ class McapPart(ChunkedPart[Chunk]):
         return [chunk for chunk in self._contents.chunks if chunk.index and channel in chunk.index]
 
     def _times(self, channel: int) -> tuple[int | None, int | None]:
-        """Return the channel's first and last log time, by the message indexes of the chunks that reach beyond what is found."""
+        """Return the channel's first and last log time, by the indexes of chunks that reach beyond the known times."""
         first: list[int] = []
         last: list[int] = []
         for found_ns, sign in ((first, 1), (last, -1)):
@@ -484,13 +484,13 @@ class McapPart(ChunkedPart[Chunk]):
 
 
 def _find_needed_bytes(chunk: Chunk) -> tuple[int, int]:
-    """Return which bytes (offset, size) are read of a chunk that holds something wanted: of a plain one, its indexes to begin with."""
+    """Return the bytes (offset, size) to read of a chunk with wanted messages; of a plain chunk, first its indexes."""
     start = chunk.offset if chunk.compression else chunk.end
     return start, chunk.end + chunk.index_bytes - start
 
 
 def _find_possible_chunks(block: memoryview, size: int) -> list[int]:
-    """Return where in ``size`` bytes a chunk's opcode is followed, at the right distance, by the length of a compression's name."""
+    """Return the offset in ``size`` bytes of a chunk's opcode, followed at the right distance by a compression name."""
     opcodes = np.frombuffer(block, np.uint8)[: max(min(size, len(block) - RECORD_HEAD - CHUNK_HEAD), 0)]
     candidates = np.flatnonzero(opcodes == OP_CHUNK)
     if not len(candidates):

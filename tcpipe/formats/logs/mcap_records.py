@@ -1,4 +1,4 @@
-"""The records of an MCAP file, as bytes, and its summary: https://mcap.dev/spec. A record: opcode, length (uint64), content."""
+"""The records of an MCAP file and its summary: https://mcap.dev/spec. A record: opcode, length (uint64), content."""
 
 from __future__ import annotations
 
@@ -68,9 +68,10 @@ class ChannelRecord:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Where a chunk lies and what it holds; a run of messages outside chunks is one without a head (``crc`` 0, no compression).
+    """Place and content of a chunk; messages outside chunks are one without a head (``crc`` 0, no compression).
 
-    ``index`` gives the byte of each channel's message index (None where the chunk has none), ``index_bytes`` how long they are together.
+    ``index`` gives the byte of each channel's message index (None where the chunk has none), ``index_bytes`` how long
+    they are together.
     """
 
     offset: int
@@ -205,9 +206,10 @@ def index_entries(record: bytes | memoryview, channel: int) -> Ints:
 def index_messages(data: bytes, records: Ints, ends: Ints, channels: Ints) -> tuple[Mask, Ints, Ints, Ints]:
     """Read several message indexes at once.
 
-    ``records``, ``ends`` and ``channels`` say of each index, shape (R,), where it begins in ``data``, before which byte it must end, and
-    of which channel it should be. The result says which of the indexes are what they should be, shape (R,), and of each message of those,
-    shape (N,), the number of its index, its log time [ns] and its offset in the chunk.
+    ``records``, ``ends`` and ``channels`` say of each index, shape (R,), where it begins in ``data``, before which byte
+    it must end, and of which channel it should be. The result says which of the indexes are what they should be, shape
+    (R,), and of each message of those, shape (N,), the number of its index, its log time [ns] and its offset in the
+    chunk.
     """
     whole = np.flatnonzero(records + RECORD_HEAD + 6 <= ends)
     right, size = np.zeros(len(records), np.bool_), np.zeros(len(records), np.int64)
@@ -233,7 +235,7 @@ def index_messages(data: bytes, records: Ints, ends: Ints, channels: Ints) -> tu
 
 
 def read_messages_at(data: memoryview, offsets: Ints) -> tuple[Messages, Mask]:
-    """Return the messages whose records begin at ``offsets``, within the data, and which of them are messages by opcode and length."""
+    """Return the messages at ``offsets`` within the data, and which of them are messages by opcode and length."""
     count = max(len(data) - _MESSAGE.itemsize + 1, 0)
     windows: NDArray[np.void] = np.ndarray((count,), f"V{_MESSAGE.itemsize}", data if count else b"", 0, (1,))
     heads = windows[offsets].view(_MESSAGE)
@@ -250,7 +252,7 @@ def read_messages_at(data: memoryview, offsets: Ints) -> tuple[Messages, Mask]:
 
 
 def record_offsets(data: bytes | memoryview, most: int) -> tuple[Ints, int]:
-    """Walk the records in ``data`` and return where each begins, and where they end: one that does not fit, or is one too many, ends it."""
+    """Walk the records in ``data``; return their offsets, and the end: the first that does not fit, or is too many."""
     size, position, found = len(data), 0, array("q")
     length_at = struct.Struct("<Q").unpack_from
     while position + RECORD_HEAD <= size and len(found) <= most:
@@ -288,7 +290,7 @@ class Contents:
     """A hash of the summary, where that names every chunk of a file that has some."""
 
     def note(self, opcode: int, content: bytes | memoryview) -> None:
-        """Remember a schema or channel; the first of a number holds, and others are not looked at, however many there are."""
+        """Keep a schema or channel; the first of a number counts, and later ones are ignored, however many."""
         number = int.from_bytes(content[:2], "little")
         if opcode == OP_SCHEMA and number not in self.schemas:
             self.schemas.setdefault(*parse_schema(content))
@@ -321,7 +323,7 @@ def read_summary(source: ByteSource) -> Contents:
 
 
 def _check(contents: Contents, file_bytes: int) -> None:
-    """Raise `DamageError` when the summary does not name what a reader needs, with a cause where it contradicts the file."""
+    """Raise `DamageError` if the summary lacks what a reader needs, with the cause if it contradicts the file."""
     indexed = {channel for chunk in contents.chunks for channel in chunk.index or ()}
     counted = contents.statistics.messages_by_channel if contents.statistics else {}
     if (

@@ -1,4 +1,4 @@
-"""Logs that are read from other files than bags: each topic is a table of messages, with the interface of `log_file.Log`."""
+"""Logs in other files than bags: each topic is a table of messages, with the interface of `log_file.Log`."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class TableLog(OpenLog):
         self.findings = [*find_damage(damage for found in topics for damage in found.damage), *findings]
 
     def sha256(self) -> str:
-        """Return the SHA-256 of all files, one after the other, by name; also of tables that are not mapped. `LogError`: the disk fails."""
+        """Return the SHA-256 of all files in order of their names, unmapped tables too. `LogError`: the disk fails."""
         return hash_files(self.files, self.size_bytes)
 
     def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
@@ -80,7 +80,7 @@ def make_stamp_fields(stamp_ns: Ints) -> dict[str, Ints]:
 def make_topic(
     name: str, type_name: str, stamp_ns: Ints, read_fields: Callable[[], Fields], damage: Sequence[Damage] = ()
 ) -> TopicMessages:
-    """Return a topic with the stamps of its messages [ns], shape (N,), as both log times; `_make_column` converts its fields."""
+    """Return a topic with the messages' stamps [ns], shape (N,), as both log times; `_make_column` makes its fields."""
 
     def make() -> pa.Table:
         times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}

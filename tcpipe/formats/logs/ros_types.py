@@ -1,8 +1,8 @@
 """Message definitions: the home of rosbags on the reading side.
 
-A definition comes, in this order, from the log itself, from a directory of .msg files the user names, from the definitions tcpipe
-bundles for its robots, or from the standard sets that rosbags bundles (ROS 1 Noetic, ROS 2 Humble). Types are kept by definition
-text, never by name alone: two logs, or two topics, may mean different things by one name.
+A definition comes, in this order, from the log itself, from a directory of .msg files the user names, from the
+definitions tcpipe bundles for its robots, or from the standard sets that rosbags bundles (ROS 1 Noetic, ROS 2 Humble).
+Types are kept by definition text, never by name alone: two logs, or two topics, may mean different things by one name.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _CODES = {
     "float64": "f8",
 }
 MAX_DEFINITION_BYTES = 1 << 20
-"""A longer definition is not read; those of the largest messages of ROS, with all that they are made of, have some 20 KB."""
+"""Longest definition that is read [byte]; those of ROS's largest messages, with all their parts, have some 20 KB."""
 _MAX_LENGTH = 1 << 31
 _MAX_DEPTH = 64
 _TYPE_NAME, _FIELD_NAME = re.compile(r"[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*"), re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -115,7 +115,7 @@ class MessageType:
 
 
 def _make_typestore(definitions: _Definitions) -> Typestore:
-    """Return rosbags' store of types; it makes Python code of their names and runs it, so that only plain names may reach it."""
+    """Return rosbags' store of types; it runs Python code made of their names, so only plain names may reach it."""
     odd = [name for name in definitions if not _TYPE_NAME.fullmatch(name)]
     odd += [field for _, fields in definitions.values() for field, _ in fields if not _FIELD_NAME.fullmatch(field)]
     if odd:
@@ -140,8 +140,8 @@ class TypeLibrary:
     ) -> MessageType | DefinitionError:
         """Return the type for a definition text ("" where the log has none).
 
-        An error is returned, not raised, where no definition is known, or it cannot be parsed, is recursive, or uses a type no reader
-        supports.
+        An error is returned, not raised, where no definition is known, or it cannot be parsed, is recursive, or uses a
+        type no reader supports.
         """
         key = (type_name, definition, schema_encoding, ros1)
         if key not in self._types:
@@ -176,7 +176,7 @@ class TypeLibrary:
         return MessageType(wire, source, definitions)
 
     def _known(self, type_name: str, definition: str, schema_encoding: str) -> tuple[_Definitions, Source]:
-        """Return what the log defines; nothing where it defines nothing, or cannot be parsed and the user gives the type."""
+        """Return the log's own definitions; none if it has none, or if they are invalid and the user gives the type."""
         given: Source = "given" if type_name in self._own else "bundled"
         if not definition.strip():
             return {}, given
@@ -353,9 +353,10 @@ def _to_plain(value: Any, wire_type: WireType) -> Any:
 
 @cache
 def load_shipped_definitions() -> Mapping[str, str]:
-    """Return the robots' own definitions by type; what they refer to (std_msgs/Header, duration) belongs to every type store.
+    """Return the robots' own definitions by type; what they use (std_msgs/Header, duration) is in every type store.
 
-    They are the packages' files without constants and comments, which change no byte; NOTICE names packages and licences.
+    They are the packages' files without constants and comments, which change no byte; NOTICE names packages and
+    licences.
     """
     packages = sorted(files("tcpipe.logs").joinpath("definitions").iterdir(), key=lambda package: package.name)
     return {

@@ -25,7 +25,7 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MAX_FILES = 4096
 """A bag of more files is refused: all are open at once. Split every minute, this is three days."""
 MAX_METADATA_BYTES = 1 << 20
-"""A longer metadata.yaml is passed over: its parser takes ten seconds for so much, and a bag is read as well without it."""
+"""Longest metadata.yaml that is read [byte]: its parser takes ten seconds for it, and a bag can be read without it."""
 
 _COPY_BYTES = 1 << 22
 _LISTED = 10
@@ -35,7 +35,7 @@ _PART = re.compile(r"(_\d+)?\.(db3|mcap)(\.zstd)?$")
 
 @dataclass(frozen=True, slots=True)
 class Rosbag2Files:
-    """The storage files of a bag in order, what is wrong with their list, and how many messages metadata.yaml counts, also by topic."""
+    """The storage files of a bag in order, problems of their list, and metadata.yaml's message counts by topic."""
 
     paths: tuple[Path, ...]
     damage: tuple[Damage, ...] = ()
@@ -44,7 +44,7 @@ class Rosbag2Files:
 
 
 def find_rosbag2_files(directory: Path) -> Rosbag2Files:
-    """Return the storage files of a bag, by metadata.yaml, or by their names where it is missing; `LogError` where it is no bag."""
+    """Return the storage files of a bag, by metadata.yaml or, without it, by name; `LogError` if it is no bag."""
     try:
         present = list_storage_files(directory)
     except OSError as error:
@@ -108,7 +108,7 @@ def _is_count(value: object) -> bool:
 
 
 def _read_topic_counts(information: Mapping[str, Any]) -> dict[str, int]:
-    """Return how many messages metadata.yaml counts of each topic; nothing where it is not as the recorder writes it."""
+    """Return metadata.yaml's message count of each topic; none if it does not have the recorder's format."""
     counts: dict[str, int] = {}
     with suppress(KeyError, TypeError):
         for entry in information["topics_with_message_count"]:
@@ -130,7 +130,7 @@ def _list_storage_names(directory: Path) -> list[str]:
 
 
 def is_one_bag(directory: Path) -> bool:
-    """Return whether a directory is one ROS 2 bag: by metadata.yaml, or by files named after it as the recorder does."""
+    """Return whether a directory is one ROS 2 bag: by metadata.yaml, or by files with the recorder's names."""
     if (directory / METADATA).is_file():
         return True
     names = _list_storage_names(directory)
@@ -165,7 +165,7 @@ def _decompress_stream(path: Path) -> Iterator[bytes]:
 
 
 def decompress_blocks(part: LogPart, wanted: frozenset[int]) -> Iterator[MessageBlock]:
-    """Yield a part's messages of the wanted channels; those that are zstd frames each (``compression_mode: MESSAGE``) decompressed."""
+    """Yield a part's messages of the wanted channels; zstd frames (``compression_mode: MESSAGE``) are decompressed."""
     compressed: dict[int, bool] = {}
     for block in part.blocks(wanted):
         if block.channel not in compressed:
@@ -215,7 +215,7 @@ def _decompress_frame(frame: memoryview) -> bytes | None:
 
 
 def _read_bag_information(path: Path) -> dict[str, Any] | None:
-    """Return what metadata.yaml says of the bag; None where it is missing or broken, as a recorder that is killed leaves it."""
+    """Return the content of metadata.yaml; None if it is missing or damaged, as after a recorder was killed."""
     from ruamel.yaml import YAML  # noqa: PLC0415  most logs are none of these
     from ruamel.yaml.error import YAMLError  # noqa: PLC0415
 

@@ -1,8 +1,8 @@
-"""The .db3 files of ROS 2: SQLite tables of topics and messages, all schema versions, read by `sqlite3` without writing beside them.
+"""The .db3 files of ROS 2: SQLite tables of topics and messages, all schema versions, read without writing.
 
-SQLite has no checksums: a byte flipped inside a message is not noticed here. But every row of the table of messages either becomes a
-message or is counted as damage, and a file whose pages contradict one another is said to be broken. Of a damaged file, ids are read
-upward until an error and downward until an error.
+SQLite has no checksums: a byte flipped inside a message is not noticed here. But every row of the table of messages
+either becomes a message or is counted as damage, and a file whose pages contradict one another is said to be broken. Of
+a damaged file, ids are read upward until an error and downward until an error.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LONGEST_BYTES, _ROW_BYTES = 1 << 28, 1 << 10
 """SQLite refuses a row that claims to be longer, or longer than its file: a chain of pages may lead back to itself."""
 _TABLES = ("topics", "messages", "message_definitions")
 _BROKEN = (sqlite3.Error, UnicodeDecodeError, MemoryError)
-"""Errors of a damaged database; the second if the name in its message is damaged, the third if a row claims to be endless."""
+"""Errors of a damaged database; the second if its message has a damaged name, the third if a row is endless."""
 _Row = tuple[int, int, int, int, bytes]
 """Row id, topic, log time, publish time, data."""
 
@@ -98,7 +98,7 @@ class SqlitePart:
             yield from _read_blocks(rows)
 
     def _open(self, path: Path) -> sqlite3.Connection:
-        """Open without locks or files beside it; a file with an unmerged journal, or that ends inside a page, through a copy."""
+        """Open without locks or files beside it; with an unmerged journal or a partial last page through a copy."""
         with path.open("rb") as file:
             head = file.read(_HEADER_BYTES)
         page_bytes = int.from_bytes(head[16:18], "big")
@@ -172,7 +172,7 @@ class SqlitePart:
             return {}
 
     def _spans(self) -> dict[int, tuple[int, int, int]]:
-        """Return count, first and last log time by topic, and note the rows that are no messages; of a broken file, what is reached."""
+        """Return count, first and last log time by topic, and note invalid rows; of a damaged file, what is reached."""
         _, is_message = self._message_columns()
         by_topic = "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages NOT INDEXED"
         try:
@@ -197,7 +197,7 @@ class SqlitePart:
         return spans
 
     def _message_columns(self) -> tuple[str, str]:
-        """Return the columns of a message (row id, topic, log time, publish time, data), and the condition that a row is one."""
+        """Return the columns of a message (row id, topic, log time, publish time, data), and what makes a row valid."""
         columns = {row[1] for row in self._database.execute("PRAGMA table_info(messages)")}
         publish = "send_timestamp" if "send_timestamp" in columns else "timestamp"
         kinds = {"id": "integer", "topic_id": "integer", "timestamp": "integer", publish: "integer", "data": "blob"}
@@ -205,7 +205,7 @@ class SqlitePart:
         return f"id, topic_id, timestamp, {publish}, data", is_message
 
     def _reachable(self, query: str) -> Iterator[Any]:
-        """Yield a query's rows by rising id, their first column; of a broken table, without what lies between two that can be read."""
+        """Yield a query's rows by rising id, their first column; of a damaged table, without unreadable rows."""
         before, low, row = _BEFORE_ALL, _BEFORE_ALL, None
         for _ in range(_MOST_HOLES):
             broken = ""
@@ -233,7 +233,7 @@ class SqlitePart:
                 yield row
 
     def _first_behind(self, query: str, low: int) -> Any:
-        """Return the row of the first id above ``low`` from which on SQLite reads, found in steps that double; None without such a row."""
+        """Return the row of the first readable id above ``low``, found in steps that double; None if there is none."""
         step = 1
         while low + step <= _LAST_ID and self._first_from(query, low + step) is None:
             step *= 2
@@ -256,7 +256,7 @@ class SqlitePart:
             return None
 
     def _note_contradictions(self) -> None:
-        """Note where the pages of a file contradict one another: SQLite reads on over much of that, and says nothing."""
+        """Note contradictions between the pages of a file, over many of which SQLite reads on without an error."""
         if self._is_cut:  # which is noted already
             return
         try:

@@ -1,4 +1,4 @@
-"""Where tables lie: the folders that the recipe maps, and the files in them; polars is loaded only where one is read."""
+"""Folders of tables that the recipe maps, and the files in them; polars is loaded only when a table is read."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def list_table_files(folder: Path) -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class TableRun:
-    """The tables of one run where a recipe's names have a ``*``: the files in which it is the same text, in one folder."""
+    """The tables of one run if a recipe's names have a ``*``: files of one folder in which it is the same text."""
 
     folder: Path
     mappings: dict[str, TableMapping]
@@ -89,10 +89,10 @@ def find_table_run(path: Location, mappings: Mappings) -> TableRun | None:
 
 
 def walk_folders(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Yield each folder with the names of folders in it, which the caller may take out, and of files; links to folders are not followed.
+    """Yield each folder, its folders (which the caller may remove) and its files; links to folders are not followed.
 
-    As `os.walk`, which on Python 3.11 calls itself as deep as folders are nested. Stores and datasets are left out: a log does not
-    change because somebody keeps its results beside it.
+    As `os.walk`, which on Python 3.11 calls itself as deep as folders are nested. Stores and datasets are left out: a
+    log does not change because somebody keeps its results beside it.
     """
     waiting = [str(folder)]
     while waiting:
@@ -112,7 +112,7 @@ def walk_folders(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
 
 
 def _is_store(place: str) -> bool:
-    """Return whether a folder contains records of calls; each call on a store writes one before it searches for logs."""
+    """Return whether a folder has records of calls; each call on a store writes one before it searches for logs."""
     with suppress(OSError):
         return any(parse_name("calls", file.name) for file in Path(place, "calls").iterdir())
     return False

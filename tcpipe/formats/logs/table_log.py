@@ -1,11 +1,13 @@
-"""A folder of tables as a log: each table that the recipe maps is a topic, its rows the messages that its role usually has.
+"""A folder of tables as a log: each mapped table is a topic, and its rows are messages as its role usually has.
 
-Behind the same face as a bag: topics, tables of messages, damage. All of it is read when it is opened; it is small beside a bag.
+Behind the same face as a bag: topics, tables of messages, damage. All of it is read when it is opened; it is small
+beside a bag.
 
-Tables that others wrote, as CSV, text in columns (TUM trajectories, RTKLIB's .pos) or Parquet: polars' lazy scan, columns by name.
+Tables that others wrote, as CSV, text in columns (TUM trajectories, RTKLIB's .pos) or Parquet: polars' lazy scan,
+columns by name.
 
-A table of text is described by its first lines: what separates its fields, what its columns are called (`column_1` and so on where it has
-no header), what is comment. A cell that is no number where one is wanted is counted, never guessed.
+A table of text is described by its first lines: what separates its fields, what its columns are called (`column_1` and
+so on where it has no header), what is comment. A cell that is no number where one is wanted is counted, never guessed.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ def open_tables(path: Path, mappings: Mappings, files: Sequence[Path] | None = N
 
 
 def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> TopicMessages | list[str]:
-    """Return a table's messages, or every problem of its mapping; ``zone`` is that of times without one, "" if none is stated."""
+    """Return a table's messages, or all problems of its mapping; ``zone`` is that of times without one, or ""."""
     where = f"recipe tables.{name}"
     role = mapping.role or name
     problems = list(find_mapping_problems(where, role, mapping.columns, mapping.units))
@@ -110,7 +112,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
 def _read_messages(
     read_as: tuple[str, str, str], file: str, values: Mapping[str, Floats], stamps: Clock, damage: Sequence[Damage]
 ) -> TopicMessages:
-    """Return a table as the messages of its topic, type and role, in order of time, and its damage with that of its cells.
+    """Return a table as its topic's messages with type and role, sorted by time, and the damage of it and its cells.
 
     Rows without any of the values are no messages: several sensors share a table, and each row is of one of them.
     """
@@ -136,7 +138,7 @@ def _read_messages(
 
 
 def _find_clock_mismatch(read: Iterable[TopicMessages]) -> Iterator[str]:
-    """Yield a line for tables that have no time in common with the longest: they are on another clock, or of another drive."""
+    """Yield a line for tables without times in common with the longest: they have another clock or drive."""
     spans = {found.topic.name: (found.topic.start_ns or 0, found.topic.end_ns or 0) for found in read}
     longest = max(spans, key=lambda name: spans[name][1] - spans[name][0], default="")
     for name, (first_ns, last_ns) in spans.items():
@@ -166,8 +168,9 @@ _EDGES = re.compile(rb"^ | (?=\r?$)", re.MULTILINE)
 class Cells:
     """The columns of a table, each of shape (N,).
 
-    ``stamps`` contains the columns of stamps as the file stores them. ``columns`` contains numbers; a cell without a number is NaN.
-    ``texts`` gives, for each column with such text, the number of cells that are text, and the row (from 1) and text of the first.
+    ``stamps`` contains the columns of stamps as the file stores them. ``columns`` contains numbers; a cell without a
+    number is NaN. ``texts`` gives, for each column with such text, the number of cells that are text, and the row (from
+    1) and text of the first.
     """
 
     stamps: dict[str, pl.Series]
@@ -214,7 +217,7 @@ def read_cells(path: Path, *, stamps: Sequence[str], columns: Sequence[str], wor
 
 
 def read_numbers(path: Path, names: Sequence[str]) -> dict[str, Floats]:
-    """Return the first rows of columns that contain numbers, shape (rows,), NaN where a cell has none; `LogError`: it is no table."""
+    """Return the first rows of numeric columns, shape (rows,), NaN for cells without a number; `LogError`: no table."""
     with _report_unreadable(path):
         frame = _collect_columns(path, [*names], numbers=[*names], rows=_SAMPLE_ROWS)
     numbers = {name: frame[name].cast(pl.Float64) for name in names if frame[name].dtype.is_numeric()}
@@ -308,7 +311,7 @@ def _is_name(field: bytes) -> bool:
 
 
 def _find_column_names(comments: list[bytes], count: int, *, spaced: bool) -> list[str]:
-    """Return the names of a table without a header: those of its last comment where they are as many, TUM's, or numbers."""
+    """Return the names of a table without a header: those of its last comment if they fit, TUM's, or numbers."""
     names = comments[-1].lstrip(b"#% ").replace(b",", b" ").split() if comments else []
     if len(names) == count:
         return [name.decode(errors="replace") for name in names]

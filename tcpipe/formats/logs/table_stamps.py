@@ -1,4 +1,4 @@
-"""Stamps of tables: counters, dates and times in words, milliseconds of a day, and counters that a coarse column ties to UTC."""
+"""Stamps of tables: counters, dates and times as text, milliseconds of a day, and counters tied to UTC coarsely."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ Kind: TypeAlias = Literal["utc", "local", "day", "counter"]
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Stamps of rows, shape (N,), null where unknown: [ns] since 1970 in UTC or in local time, since midnight, or of a counter.
+    """Stamps of rows, shape (N,), null if unknown: [ns] since 1970 (UTC or local), since midnight, or of a counter.
 
-    ``unit`` is that of numbers whose size and name state none, by their steps; ``sample`` is the first text, "" of numbers; ``notes`` are
-    assumptions.
+    ``unit`` is that of numbers whose size and name state none, by their steps; ``sample`` is the first text, "" of
+    numbers; ``notes`` are assumptions.
     """
 
     kind: Kind
@@ -72,7 +72,8 @@ def find_stamps(
 ) -> Clock | str:
     """Return the stamps of a table of the recipe in UTC, or of a counter; in words why they cannot be read.
 
-    ``columns`` contains the columns that ``stamp``, ``stamp_date`` and ``stamp_utc`` name, ``zone`` that of times without one.
+    ``columns`` contains the columns that ``stamp``, ``stamp_date`` and ``stamp_utc`` name, ``zone`` that of times
+    without one.
     """
     try:
         found = _read_stamps(columns, stamp, mapping, "UTC" if mapping.stamp_utc else zone, path)
@@ -104,7 +105,7 @@ def _read_stamps(
 
 
 def _read_dated(column: pl.Series, dates: pl.Series | None, *, form: str = "", unit: str = "auto") -> Clock | str:
-    """Return what a column counts, together with the dates beside it if it has times of day alone; in words why it is no clock."""
+    """Return what a column counts, with the column of dates if it has times of day; or a text why it is no clock."""
     clock = read_clock(column, form=form, unit=unit)
     if dates is None or column.dtype not in (pl.String, pl.Time) or getattr(clock, "kind", "day") != "day":
         return clock
@@ -199,9 +200,10 @@ def _unwrap_days(ns: pl.Series) -> pl.Series:
 def _convert_to_utc(clock: Clock, zone: str, stated: str, path: Path) -> Clock | str:
     """Convert local times, or times of day, to UTC; a time that the zone's clocks skip becomes null.
 
-    A time in the hour that the clocks repeat means its first pass, and after a row that steps back its second pass. The date of times of
-    day is ``stated``, else in the file's name, else the one that brings the last row nearest to the file's last change. Return a message
-    if the date is wrong or every time is skipped. Raise `PolarsError` if the zone does not exist.
+    A time in the hour that the clocks repeat means its first pass, and after a row that steps back its second pass. The
+    date of times of day is ``stated``, else in the file's name, else the one that brings the last row nearest to the
+    file's last change. Return a message if the date is wrong or every time is skipped. Raise `PolarsError` if the zone
+    does not exist.
     """
     notes, ns = clock.notes, clock.ns
     if clock.kind == "day":
@@ -245,8 +247,8 @@ def _tie_to_utc(clock: Clock, utc: Clock) -> Clock | str:
 def choose_clock(columns: Mapping[str, pl.Series]) -> tuple[Clock, RecipeKeys] | None:
     """Return the clock among columns that may be stamps, and the keys that state it, None without one.
 
-    It is the finest: rows of a wide table share a coarse time, as whole seconds of GNSS. Of equally fine ones, dates go before counters,
-    numbers before texts, which are often cut to seconds.
+    It is the finest: rows of a wide table share a coarse time, as whole seconds of GNSS. Of equally fine ones, dates go
+    before counters, numbers before texts, which are often cut to seconds.
     """
     dates = next((column for name, column in columns.items() if re.fullmatch("(.*_)?date", simplify_name(name))), None)
     read = {name: _read_candidate(column, dates) for name, column in columns.items()}

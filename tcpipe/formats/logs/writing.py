@@ -1,8 +1,9 @@
 """Writing logs: columns of numbers become messages in a .mcap, a ROS 1 .bag or a ROS 2 bag directory.
 
-The home of mcap's writer and of rosbags on the writing side. Every message of a stream has one layout (its strings and sequences keep
-their lengths), so that one example is serialised by rosbags and the rest are copies of its bytes with the columns patched in; where a
-field lies is found by serialising it twice with different bytes, not by a second model of the encoding.
+The home of mcap's writer and of rosbags on the writing side. Every message of a stream has one layout (its strings and
+sequences keep their lengths), so that one example is serialised by rosbags and the rest are copies of its bytes with
+the columns patched in; where a field lies is found by serialising it twice with different bytes, not by a second model
+of the encoding.
 """
 
 from __future__ import annotations
@@ -41,9 +42,9 @@ _MISSING_IN_ROSBAGS = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped
 class MessageStream:
     """One topic, ready to be written.
 
-    ``columns`` hold what differs from message to message, by dotted field name, one row a message: numbers, arrays of one length
-    (second axis), or bytes of one length for strings. ``constants`` hold the rest by dotted name
-    (lists of dicts for lists of messages); what neither names is zero or empty.
+    ``columns`` hold what differs from message to message, by dotted field name, one row a message: numbers, arrays of
+    one length (second axis), or bytes of one length for strings. ``constants`` hold the rest by dotted name (lists of
+    dicts for lists of messages); what neither names is zero or empty.
     """
 
     topic: str
@@ -60,7 +61,7 @@ class MessageStream:
 def write_mcap(
     path: Path, streams: Sequence[MessageStream], *, encoding: Encoding = "cdr", compression: McapCompression = "zstd"
 ) -> None:
-    """Write a log in chunks with CRCs: ROS 2 (cdr), or ROS 1 messages in MCAP (ros1); streams of one topic share its channel."""
+    """Write a log in chunks with CRCs: ROS 2 (cdr), or ROS 1 in MCAP (ros1); streams of a topic share a channel."""
     version = 1 if encoding == "ros1" else 2
     codec = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
     with write_atomic_file(path) as temporary, temporary.open("wb") as out:

@@ -72,7 +72,7 @@ class MoreLayers:
     files: Mapping[str, Files] = field(default_factory=dict)
     """Rasters by the layer's name."""
     categorical: Mapping[str, Path | None] = field(default_factory=dict)
-    """Those of them whose values are classes, and their class tables; None: the raster's own names say what its values mean."""
+    """Rasters whose values are classes, and their class tables; None: the raster's own names give the meanings."""
     ortho_bands: OrthoBands = "grey"
     """rgb: the orthophoto's colours, too."""
 
@@ -96,16 +96,18 @@ def build_map(
     Parameters
     ----------
     out_path : the Zarr directory; an existing one is replaced once the new one is complete.
-    height, ortho, terrain : rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one grid
-        (`layer_building`); terrain also as GeoJSON polygons (`terrain_polygons`).
+    height, ortho, terrain : rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one
+        grid (`layer_building`); terrain also as GeoJSON polygons (`terrain_polygons`).
     more : other layers, put on the grid of these three.
-    classes : class table (CSV or TOML); None takes ``agreed``, the classes of the store's other maps, else the paper's seven classes. Where
-        the terrain raster names its values, those names say which class each is.
-    crs : the map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's, or its UTM zone.
+    classes : class table (CSV or TOML); None takes ``agreed``, the classes of the store's other maps, else the paper's
+        seven classes. Where the terrain raster names its values, those names say which class each is.
+    crs : the map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's,
+    or its UTM zone.
     pixel_size_m : side of a map pixel [m]; None takes the finest raster's.
     inputs : what the caller wants to know the map by later; kept in its facts.
 
-    `MapError`: a raster has no CRS, cannot be read, or holds nothing here; the class table is not the store's: one line each.
+    `MapError`: a raster has no CRS, cannot be read, or holds nothing here; the class table is not the store's: one line
+    each.
     """
     given = {"height": height, "ortho": ortho, "terrain": terrain, **more.files}
     paths = {role: [files] if isinstance(files, Path) else list(files) for role, files in given.items() if files}
@@ -184,7 +186,7 @@ def _read_own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[s
 
 
 def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Raster | None) -> tuple[ClassScheme, str]:
-    """Return the classes and where they come from: ``file``, ``names`` of the raster's values, ``store`` or ``default``."""
+    """Return the classes and their source: ``file``, ``names`` of the raster's values, ``store`` or ``default``."""
     if classes is not None:
         scheme = read_class_scheme(classes)
         if different := () if agreed is None else scheme.table.differences(agreed.table):
@@ -253,7 +255,7 @@ def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -
 
 
 def _find_assumed(terrain: LayerSource | None) -> tuple[Finding, ...]:
-    """Return the finding, if any, that values of the terrain are read as the paper's classes, although nothing names them."""
+    """Return the finding, if any, that terrain values are read as the paper's classes although nothing names them."""
     values = [] if terrain is None else terrain.values
     known = [f"{entry.id} as {entry.name}" for entry in PAPER_SCHEME.table.classes if entry.id in values]
     if not known:

@@ -1,14 +1,13 @@
 """GeoTIFF, JPEG 2000 and ERDAS Imagine, as windows of numbers with their validity: the one home of rasterio.
 
-GDAL opens whatever a file's content says, also what is on another disk or another continent. So tcpipe checks a user's file first:
-its first bytes determine its one driver, and the files of its name in the same folder must be plain too. Virtual rasters (VRT), which
-name other files, are not supported.
+GDAL opens whatever a file's content says, also what is on another disk or another continent. So tcpipe checks a user's
+file first: its first bytes determine its one driver, and the files of its name in the same folder must be plain too.
+Virtual rasters (VRT), which name other files, are not supported.
 
-A raster is opened *for a role* (height, ortho, terrain, or a layer of the user's) and refused at once, in one line, if it cannot play
-it: no place on the earth, placed by control points only, wrong bands, wrong numbers.
-Pixel-is-point tags, south-up and rotated affines, scale and offset
-tags, units, palettes, alpha, mask bands, nodata tags and NaN are dealt with here; what leaves is metres, grey from 0 to 255, or raw
-class values, each with a mask.
+A raster is opened *for a role* (height, ortho, terrain, or a layer of the user's) and refused at once, in one line, if
+it cannot play it: no place on the earth, placed by control points only, wrong bands, wrong numbers. Pixel-is-point
+tags, south-up and rotated affines, scale and offset tags, units, palettes, alpha, mask bands, nodata tags and NaN are
+dealt with here; what leaves is metres, grey from 0 to 255, or raw class values, each with a mask.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ from tcpipe.terrain.layers import LUMA_RGB
 from tcpipe.terrain.target_grid import MapGrid
 
 Use = Literal["metres", "grey", "red", "green", "blue", "classes", "numbers"]
-"""Content of a raster: heights, an orthophoto or one of its colours, class values, or numbers in a unit of their own."""
+"""Content of a raster: heights, an orthophoto or one of its colours, class values, or numbers in their own unit."""
 
 USES: dict[str, Use] = {"height": "metres", "ortho": "grey", "terrain": "classes"}
 """Use by role."""
@@ -75,7 +74,7 @@ _DRIVERS = {
     **dict.fromkeys((b"\0\0\0\x0cjP  \r\n\x87\n", b"\xff\x4f\xff\x51"), "JP2OpenJPEG"),
     _HFA: "HFA",
 }
-"""Drivers by what a file begins with. All have a zero byte there, which ends the text that GDAL's other drivers look into."""
+"""Drivers by the first bytes of a file. All have a zero byte there, which ends the text that other drivers read."""
 
 _OTHERS = {
     b"\x89PNG": "PNG",
@@ -107,15 +106,15 @@ _MAX_BLOCK_BYTES = 256_000_000
 _MAX_STATISTICS_BYTES = 16_000_000
 
 _OPAQUE = 1
-"""A pixel is there if its mask or alpha is at least this: 16-bit alpha is often written as 255, which is almost transparent."""
+"""Least mask or alpha of a valid pixel; 16-bit alpha is often written as 255, which is almost transparent."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tile:
     """A raster file that can be used as its role; `read_window` reads it.
 
-    ``affine`` is (a, b, c, d, e, f) of x = a·col + b·row + c, y = d·col + e·row + f at pixel *corners*; ``crs`` is WKT, or empty where
-    the file has none; ``findings`` are about its bands and tags.
+    ``affine`` is (a, b, c, d, e, f) of x = a·col + b·row + c, y = d·col + e·row + f at pixel *corners*; ``crs`` is WKT,
+    or empty where the file has none; ``findings`` are about its bands and tags.
     """
 
     path: Path
@@ -150,7 +149,7 @@ OpenFile = Callable[[Path, str], Any]
 
 @contextmanager
 def keep_open() -> Iterator[OpenFile]:
-    """Yield a function that opens rasters, with GDAL set up as `GDAL_CONFIG` says; a few stay open, those that were read last."""
+    """Yield a function that opens rasters with GDAL set up as `GDAL_CONFIG`; those read last stay open."""
     kept = lru_cache(_MAX_OPEN)(_open)
     with rasterio.Env(**GDAL_CONFIG):
         try:
@@ -162,10 +161,10 @@ def keep_open() -> Iterator[OpenFile]:
 def read_window(  # noqa: PLR0917
     open_file: OpenFile, tile: Tile, row0: int, row1: int, col0: int, col1: int, shape: tuple[int, int] | None = None
 ) -> tuple[NDArray[Any], Mask]:
-    """Return a window inside a tile, and which of its pixels have data; `MapError`: they are damaged, or the file is gone.
+    """Return a window of a tile, and which of its pixels have data; `MapError`: they are damaged, or the file is gone.
 
-    Values are float64 metres or numbers, float64 grey or colour from 0 to 255, or raw integers of classes. If the ``shape`` is smaller
-    than the window, GDAL takes the nearest pixels, from the file's overviews if it has any.
+    Values are float64 metres or numbers, float64 grey or colour from 0 to 255, or raw integers of classes. If the
+    ``shape`` is smaller than the window, GDAL takes the nearest pixels, from the file's overviews if it has any.
     """
     window = Window(col0, row0, col1 - col0, row1 - row0)
     dataset = open_file(tile.path, tile.driver)
@@ -210,7 +209,8 @@ def _read_grey(dataset: Any, tile: Tile, raw: NDArray[Any], weights_rgb: tuple[f
 def read_tile(path: Path, role: str, use: Use) -> Tile:
     """Return a raster file as the tile of a role.
 
-    `MapError`: it is no raster of a kind that is read, names files elsewhere, has no place on the earth, or its bands cannot play the role.
+    `MapError`: it is no raster of a kind that is read, names files elsewhere, has no place on the earth, or its bands
+    cannot play the role.
     """
     with rasterio.Env(**GDAL_CONFIG):
         driver, _ = _list_plain_files(path)
@@ -244,13 +244,13 @@ def read_tile(path: Path, role: str, use: Use) -> Tile:
 
 
 def list_raster_files(path: Path) -> tuple[Path, ...]:
-    """Return every file of a raster: itself, and files of its name in the same folder (masks, world files, statistics)."""
+    """Return all files of a raster: itself, and files of its name in its folder (masks, world files, statistics)."""
     with rasterio.Env(**GDAL_CONFIG):
         return _list_plain_files(path)[1]
 
 
 def _find_driver(path: Path, raster: Path) -> str:
-    """Return the driver of a file by its first bytes, as GDAL does; ``raster`` is that file or the raster that it belongs to."""
+    """Return a file's driver by its first bytes, as GDAL does; ``raster`` is that file or the raster it belongs to."""
     head = _read_beginning(path)
     for start, driver in _DRIVERS.items():
         if head.startswith(start):
@@ -279,7 +279,7 @@ def _read_beginning(path: Path) -> bytes:
 
 
 def _list_plain_files(path: Path, raster: Path | None = None) -> tuple[str, tuple[Path, ...]]:
-    """Return a raster's driver and files, itself first; `MapError` if one of them names a file elsewhere or is too large.
+    """Return a raster's driver and files, itself first; `MapError` if one of them names another file or is too large.
 
     ``raster`` is the raster to which it belongs, if any.
     """
@@ -316,7 +316,7 @@ def check_layout(dataset: Any, where: str, remedy: str) -> None:
 
 
 def _refuse_beside(path: Path) -> None:
-    """Refuse masks, overviews and statistics beside a raster that GDAL would follow elsewhere, or that are too large."""
+    """Refuse masks, overviews and statistics of a raster that point GDAL to other places or are too large."""
     endings = [ending for lower in (".msk", ".ovr", ".aux") for ending in (lower, lower.upper())]
     names = [*(f"{path.name}{ending}" for ending in endings), *(f"{path.stem}{ending}" for ending in endings[-2:])]
     for beside in (path.with_name(name) for name in names if name != path.name):
@@ -412,7 +412,7 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
 def _read_scaling(
     dataset: Any, path: Path, role: str, use: Use, bands: tuple[int, ...]
 ) -> tuple[tuple[float, float], tuple[Finding, ...]]:
-    """Return scale and offset to metres, numbers or grey; for grey and classes, a finding that such tags were not applied."""
+    """Return scale and offset to metres, numbers or grey; for grey and classes, a finding that tags were ignored."""
     scale, offset = dataset.scales[bands[0] - 1], dataset.offsets[bands[0] - 1]
     if use == "numbers":
         return (scale, offset), ()
@@ -437,7 +437,7 @@ def _read_scaling(
 
 
 def _find_vertical_unit_m(dataset: Any, path: Path) -> float:
-    """Return the unit of a compound CRS's heights [m]; a metre where the CRS says nothing of heights and is metric itself."""
+    """Return the unit of a compound CRS's heights [m]; a metre if the CRS has no height unit and is metric itself."""
     crs = CRS.from_wkt(dataset.crs.to_wkt()) if dataset.crs else None
     vertical = [part for part in crs.sub_crs_list if part.is_vertical] if crs else []
     if vertical:
@@ -451,7 +451,7 @@ def _find_vertical_unit_m(dataset: Any, path: Path) -> float:
 
 
 def _describe_as_vrt(dataset: Any) -> str:
-    """Return the dataset as a VRT document: GDAL's own reading of attribute tables and names, wherever a format keeps them."""
+    """Return the dataset as a VRT document: GDAL's own reading of attribute tables and names in any format."""
     with MemoryFile(ext=".vrt") as memory:
         rasterio.shutil.copy(dataset, memory.name, driver="VRT")
         return str(memory.read().decode("utf-8", "replace"))
@@ -528,7 +528,7 @@ def _convert_late_errors() -> Iterator[None]:
 
 
 def _read_again(path: Path) -> None:
-    """Read every pixel of a file: where the disk was full GDAL closes it without a word, and the end of it is missing."""
+    """Read every pixel of a file: on a full disk GDAL closes it without an error, and its end is missing."""
     with rasterio.open(path) as dataset:
         for first in range(0, dataset.height, _STRIP_ROWS):
             dataset.read(window=Window(0, first, dataset.width, min(_STRIP_ROWS, dataset.height - first)))
@@ -560,7 +560,7 @@ def write_cog(
 
 
 def read_bands(path: Path, bands: Sequence[int]) -> NDArray[Any]:
-    """Return bands, counted from 1, of a GeoTIFF that `write_cog` wrote, shape (B, rows, cols). `MapError`: it cannot be read."""
+    """Return bands, counted from 1, of a GeoTIFF from `write_cog`, shape (B, rows, cols). `MapError`: unreadable."""
     try:
         with keep_open() as open_file:
             dataset = open_file(path, _list_plain_files(path)[0])

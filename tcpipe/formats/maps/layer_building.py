@@ -1,7 +1,8 @@
-"""One layer of a map: its raster (one file, or many tiles on one grid) or polygons, put on the map's grid shard by shard, and counted.
+"""One layer of a map: its raster (one file, or tiles on one grid) or polygons, resampled shard by shard and counted.
 
-Tiles share CRS, type, bands and grid (to a twentieth of a pixel). Where they overlap, the later file lies on top wherever it has data, as
-with gdalwarp; what no tile covers has no data. A few files are open at one time, however many there are.
+Tiles share CRS, type, bands and grid (to a twentieth of a pixel). Where they overlap, the later file lies on top
+wherever it has data, as with gdalwarp; what no tile covers has no data. A few files are open at one time, however many
+there are.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class Raster:
         return label_files([Path(tile.path.name) for tile in self.tiles])
 
     def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], Mask]:
-        """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.read_window` does of one tile."""
+        """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.read_window`."""
         low = np.maximum(self._corners[:, ::2], (row0, col0))
         high = np.minimum(self._corners[:, 1::2], (row1, col1))
         values = np.zeros((row1 - row0, col1 - col0), self.tiles[0].dtype)
@@ -87,7 +88,7 @@ class Raster:
 
 
 def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile, crs: CRS | None = None) -> Raster:
-    """Return the tiles of a role, in the order in which they are laid, the last on top; ``crs`` is that of tiles that carry none.
+    """Return the tiles of a role in drawing order, the last on top; ``crs`` is that of tiles without one.
 
     `MapError`: one of them cannot play the role, or they are not of one kind and one grid, or have no CRS.
     """
@@ -155,7 +156,7 @@ def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: s
 
 
 def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, float, float, float], Ints]:
-    """Return the affine of all tiles together, and the place of each in it: first row, last row, first column, last column."""
+    """Return the affine of all tiles together, and each one's first row, last row, first column, last column in it."""
     pixels = [tuple(f"{tile.affine[n]:.6g}" for n in (0, 1, 3, 4)) for tile in tiles]
     base = pixels.index(Counter(pixels).most_common(1)[0][0])
     at, off = _find_grid_positions(tiles, base)
@@ -180,7 +181,7 @@ def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, fl
 
 
 def _find_grid_positions(tiles: Sequence[Tile], base: int) -> tuple[Floats, Mask]:
-    """Return the column and row of every tile's first pixel on the grid of one of them, shape (T, 2), and which do not lie on it."""
+    """Return column and row of every tile's first pixel on the grid of one tile, shape (T, 2), and which are off it."""
     affines = np.array([tile.affine for tile in tiles], np.float64).reshape(-1, 2, 3)
     sizes = np.array([(tile.cols, tile.rows) for tile in tiles])
     starts = affines[:, :, 2] - affines[base, :, 2]
@@ -220,7 +221,7 @@ _TAIL = 0.001
 
 @dataclass(slots=True)
 class Plateau:
-    """Pixels of exactly the smallest value of a raster; ``counts`` are these, steps to their neighbours, and the large steps."""
+    """Pixels of exactly the smallest value of a raster; ``counts``: these, steps to their neighbours, large steps."""
 
     value: float = math.inf
     counts: Ints = field(default_factory=lambda: np.zeros(3, np.int64))
@@ -261,7 +262,7 @@ class Tally:
     """Plateaus of values times 1 and times -1; heights have only the first."""
 
     def count(self, layer: Layer, label: str, shard: Pixels) -> bool:
-        """Count the pixels of a shard and return whether any has data; `MapError` if heights are not metres of dry land."""
+        """Count the pixels of a shard and return whether any has data; `MapError` if heights are not metres of land."""
         if layer.kind == "categorical":
             found = np.bincount(shard.reshape(-1), minlength=256)
             self.by_class += found
@@ -353,7 +354,7 @@ class RasterLayer:
         return sorted({*(np.flatnonzero(self.tally.by_class[1:]) + 1).tolist(), *self.tally.unnamed})
 
     def list_findings(self) -> tuple[Finding, ...]:
-        """Return the raster's findings, and those on a rough datum shift, values that are no class, isolated values and a narrow range."""
+        """Return the raster's findings: rough datum shift, values without a class, isolated values, narrow range."""
         subject = Subject("layer", self.layer.name)
         rough = self.projection.find_rough_shift(subject) if self.projection else ()
         found = self._find_unnamed(subject) if self.tally.unnamed else self._find_isolated(subject)
@@ -366,7 +367,7 @@ class RasterLayer:
         yield make_finding("class-values-unnamed", subject, names=names, pixel_count=count, value_count=len(unnamed))
 
     def _find_isolated(self, subject: Subject) -> Iterator[Finding]:
-        """Yield findings on values that are probably no data, and on a photo that uses little of 16 bits; white may be a collar."""
+        """Yield findings on values that are probably no data, and on a photo that uses few of 16 bits."""
         names = {"file": self.name}
         least = 0.0 if self.layer.kind == "relative" else read_threshold(_ISOLATED, "min_ortho_fraction")
         for sign, plateau in self.tally.plateaus.items():
@@ -432,14 +433,14 @@ def split_colours(ortho: Raster) -> dict[str, Raster]:
 
 
 _PICTURE_BLOCK_PX = 128
-"""Side of the parts of a picture that are read for all colours in turn: GDAL keeps their pixels, and decodes them once."""
+"""Side of the parts of a picture that are read for all colours in turn [px]: GDAL decodes and keeps them once."""
 
 _PICTURE_TAPS = 3
 """Least source pixels that are averaged, each way, for a pixel of a picture; of a finer raster some are left out."""
 
 
 def draw_colours(ortho: RasterLayer, side_px: int) -> NDArray[np.uint8] | None:
-    """Return an orthophoto of at most ``side_px`` a side in colour, shape (R, C, 3), no data in white; None of a grey one."""
+    """Return an orthophoto of at most ``side_px`` in colour, shape (R, C, 3), no data in white; None of a grey one."""
     colours = split_colours(ortho.raster)
     if not colours:
         return None

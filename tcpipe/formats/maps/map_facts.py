@@ -1,4 +1,4 @@
-"""Facts of a map: its inputs, the results of building it, its summary, and its layers as JSON values and CF attributes."""
+"""Facts of a map: its inputs, the results of its build, its summary, and layers as JSON values and CF attributes."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ _NAME_TITLES = ("class name", "classname", "class names", "class", "name", "labe
 
 
 def read_value_names(vrt: str, band: int) -> dict[int, str]:
-    """Return names by value of a band, from 1, by a VRT document that GDAL wrote of a raster; those of the attribute table come first."""
+    """Return names by value of a band, from 1, by GDAL's VRT document of a raster; the attribute table has priority."""
     root = fromstring(vrt)  # noqa: S314  GDAL wrote it
     described = root.find(f"./VRTRasterBand[@band='{band}']")
     if described is None:
@@ -212,7 +212,7 @@ def describe_layer(layer: Layer) -> Description:
 
 
 def read_layers(found: Mapping[str, Description], classes: Sequence[TerrainClass], path: Path) -> dict[str, Layer]:
-    """Return the layers that `describe_layer` wrote into ``path``, by name; ``classes`` are those of terrain, if any."""
+    """Return the layers that `describe_layer` wrote to ``path``, by name; ``classes`` are those of terrain, if any."""
     layers: dict[str, Layer] = {}
     for name, description in found.items():
         about = parse_typed(description, _LayerDescription, path)

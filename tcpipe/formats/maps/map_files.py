@@ -13,10 +13,10 @@ x, y         float64  pixel centres in the map's CRS [m]
 spatial_ref  int64    CF grid mapping: the CRS as WKT, and GDAL's GeoTransform
 ===========  =======  ==========================================================================
 
-The groups ``overviews/2``, ``overviews/4`` … hold the same arrays at coarser levels (`tcpipe.terrain.resampling`), and the array
-``overviews/rgb`` is the small picture that pages show of an orthophoto in colour. Attributes follow
-CF (``grid_mapping``, ``flag_values``) and GeoZarr (``proj:``, ``spatial:``), so that xarray opens map and overviews as they are, and
-so does GDAL from 3.13 on, the first that reads shards.
+The groups ``overviews/2``, ``overviews/4`` … hold the same arrays at coarser levels (`tcpipe.terrain.resampling`), and
+the array ``overviews/rgb`` is the small picture that pages show of an orthophoto in colour. Attributes follow CF
+(``grid_mapping``, ``flag_values``) and GeoZarr (``proj:``, ``spatial:``), so that xarray opens map and overviews as
+they are, and so does GDAL from 3.13 on, the first that reads shards.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class MapFile(MapReader):
             return self._levels[self._factor][layer].window(row0, row1, col0, col1)
 
     def read_picture(self) -> NDArray[np.uint8] | None:
-        """Return the orthophoto in colour, shape (R, C, 3), at most `PICTURE_PX` a side; None of a map without colours."""
+        """Return the orthophoto in colour, shape (R, C, 3), at most `PICTURE_PX` a side; None without colours."""
         with _name_damage(f"map {self.name}: its picture"):
             return self._picture.chunk((0, 0, 0)) if self._picture else None
 
@@ -157,7 +157,8 @@ def _name_damage(what: str) -> Iterator[None]:
 def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool = True) -> MapFile:
     """Open a map for reading; its shards are in the folders of their descriptions, or are ``fetched``.
 
-    `MapError`: no map of this program; or, if ``proved``, changed descriptions or missing files: lost tiles would read as no data.
+    `MapError`: no map of this program; or, if ``proved``, changed descriptions or missing files: lost tiles would read
+    as no data.
     """
     if not (path / DESCRIPTION).is_file():
         raise MapError(f"{path}: not a map, it has no {DESCRIPTION}; add one with: tcpipe add-map")
@@ -194,7 +195,7 @@ def open_map(path: Path, fetched: FetchedShards | None = None, *, proved: bool =
 
 
 def _refuse_sizes(kept: _Attributes, path: Path) -> None:
-    """Raise `StoreError` if the stated size of a map is above the limits, or its tiles and levels are not those that tcpipe writes."""
+    """Raise `StoreError` if a map's stated size is above the limits, or its tiles and levels are not tcpipe's."""
     rows, cols, pixel_size_m = kept.grid.rows, kept.grid.cols, kept.grid.pixel_size_m
     if not (0 < rows <= MAX_SIDE_PX and 0 < cols <= MAX_SIDE_PX and rows * cols <= MAX_PIXELS and pixel_size_m > 0):
         raise StoreError(
@@ -238,7 +239,7 @@ def _shape_array(whole: MapGrid, factor: int) -> tuple[Shape, Shape, Shape]:
 
 
 def _prove(path: Path, fetched: FetchedShards | None) -> None:
-    """Compare what describes a map with its checksums, and its other files by size: their tiles carry checksums of their own."""
+    """Compare a map's descriptions with their checksums, and its other files by size: tiles contain their checksums."""
     listed = read_checksums(path)
     prove_files(path, listed, [name for name in listed if Path(name).name == DESCRIPTION])
     size_of = fetched.size if fetched else os.path.getsize
@@ -277,7 +278,7 @@ class MapWriter:
         """Reference of stored heights [m]: the floor of the smallest height of the first shard with heights."""
 
     def write(self, layer: str, row0: int, col0: int, values: Pixels) -> None:
-        """Write a shard of a layer; its corner is at a multiple of `SHARD_PX`, no data are NaN in floats and 0 in bytes."""
+        """Write a shard of a layer, its corner at a multiple of `SHARD_PX`; no data is NaN in floats and 0 in bytes."""
         if self._layers[layer].kind == "relative":
             if self.height_reference_m is None and np.isfinite(values).any():
                 self.height_reference_m = float(np.floor(np.nanmin(values)))

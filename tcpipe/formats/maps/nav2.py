@@ -1,9 +1,9 @@
-"""Files of Nav2: maps and filter masks of map_server, parameters, path messages, GPS waypoints, and graphs of the route server.
+"""Files of Nav2: maps and filter masks of map_server, parameters, path messages, GPS waypoints, route graphs.
 
-A map is a grey picture (.pgm) and its description (.yaml). In mode ``scale`` grey falls from white (cost 0) in even steps to almost black
-(98). Black alone is above ``occupied_thresh``: lethal to every reader, also to those that end the scale at 99. A .pgm has no alpha, so
-that unknown cells are lethal. In mode ``raw`` a pixel is the value itself. Messages are JSON, which is YAML too: ``ros2`` commands read
-both.
+A map is a grey picture (.pgm) and its description (.yaml). In mode ``scale`` grey falls from white (cost 0) in even
+steps to almost black (98). Black alone is above ``occupied_thresh``: lethal to every reader, also to those that end the
+scale at 99. A .pgm has no alpha, so that unknown cells are lethal. In mode ``raw`` a pixel is the value itself.
+Messages are JSON, which is YAML too: ``ros2`` commands read both.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ _OCCUPIED = 0.995
 def write_nav2_map(path: Path, cost: Bytes, grid: MapGrid, *, frame: str, meaning: str) -> None:
     """Write ``path`` (.yaml) and the picture of the same name beside it.
 
-    ``cost`` is from 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first; ``grid`` places the cells in the frame; ``frame`` and
-    ``meaning`` are comments: the axes x and y, and the meaning of a cost.
+    ``cost`` is from 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first; ``grid`` places the cells in the
+    frame; ``frame`` and ``meaning`` are comments: the axes x and y, and the meaning of a cost.
     """
     grey = np.where(cost == LETHAL, 0.0, np.rint(255.0 * (1.0 - _OCCUPIED * cost / 100.0))).astype(np.uint8)
     _write_grey(path, grey, grid, mode="scale", comments=(meaning, f"frame: {frame}"))
 
 
 def write_nav2_mask(path: Path, values: Bytes, grid: MapGrid, *, frame: str, meaning: str) -> None:
-    """Write the mask of a costmap filter as `write_nav2_map`, in mode ``raw``: a pixel is the mask's value, 0 to 100."""
+    """Write a costmap filter's mask as `write_nav2_map` does, in mode ``raw``: a pixel is its value, 0 to 100."""
     _write_grey(path, values, grid, mode="raw", comments=(meaning, f"frame: {frame}"))
 
 
@@ -81,7 +81,8 @@ global_costmap:
 planner_server:
   ros__parameters:
     planner_plugins: [GridBased]
-    # cost of a metre: 1 + multiplier * cost / 252, in proportion to {quantity} from {lowest:.6g} to {highest:.6g} {unit}
+    # cost of a metre: 1 + multiplier * cost / 252, in proportion to {quantity} from {lowest:.6g} to {highest:.6g}
+    # {unit}
     GridBased: {{plugin: nav2_smac_planner::SmacPlanner2D, cost_travel_multiplier: {multiplier:.4f}}}
 keepout_mask_server: {{ros__parameters: {{yaml_filename: keepout.yaml, topic_name: keepout_mask}}}}
 keepout_info_server:
@@ -93,7 +94,7 @@ speed_info_server:  # type 2: a limit in m/s
 
 
 def format_nav2_parameters(*, quantity: str, unit: str, lowest: float, highest: float, speed_step_mps: float) -> str:
-    """Return parameters of Nav2's servers for a map of a cost a metre, its masks and a planner to which the cost is in proportion.
+    """Return parameters of Nav2's servers for a cost map, its masks and a planner whose cost is proportional to it.
 
     Parameters
     ----------
@@ -111,7 +112,7 @@ _POSE_M = 0.25
 
 
 def make_path_message(xy_m: Floats) -> Json:
-    """Return a ``nav_msgs/Path`` along points in the frame ``map`` [m], shape (P, 2), with the course of travel as yaw."""
+    """Return a ``nav_msgs/Path`` along points in the frame ``map`` [m], shape (P, 2), with the course as yaw."""
     away_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))]
     between_m = np.linspace(0.0, away_m[-1], int(np.ceil(away_m[-1] / _POSE_M)) + 1)
     along_m = np.unique(np.r_[away_m, between_m])
@@ -127,7 +128,8 @@ def make_path_message(xy_m: Floats) -> Json:
 def make_gps_waypoints(lonlat_deg: Floats, enu_m: Floats) -> Json:
     """Return the goal of ``nav2_msgs/action/FollowGPSWaypoints``: the points of a path after its start, shape (P, 2).
 
-    ``enu_m`` are the same points in a true east-north frame [m]; a waypoint has the yaw with which the path arrives there.
+    ``enu_m`` are the same points in a true east-north frame [m]; a waypoint has the yaw with which the path arrives
+    there.
     """
     poses = [
         {"position": {"latitude": lat, "longitude": lon, "altitude": 0.0}, "orientation": orientation}
@@ -163,7 +165,7 @@ class RouteEdge:
 
 @dataclass(frozen=True, slots=True)
 class RouteGraph:
-    """A graph: the file without its features, its features but the edges, nodes (x and y [m] by id), and edges in the file's order."""
+    """A graph: the file without features, its features except edges, nodes (x, y [m] by id), and edges in order."""
 
     document: Mapping[str, Json]
     others: Sequence[Json]
@@ -189,7 +191,7 @@ def _make_edge(edge_id: int, start: int, end: int, nodes: Mapping[int, tuple[flo
 
 
 def read_route_graph(path: Path) -> RouteGraph:
-    """Read a graph; all that Nav2's loader would reject is a `PathError`, and nodes in several frames, which tcpipe cannot place."""
+    """Read a graph; `PathError` for all that Nav2's loader rejects, and for nodes in several frames."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

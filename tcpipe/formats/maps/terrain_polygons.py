@@ -1,8 +1,8 @@
 """Terrain drawn by hand: GeoJSON polygons with a property ``class``, as QGIS saves an annotated orthophoto.
 
-The property is a class name of the class table (case, '_' and '-' do not matter), or a number: a value of the table, as in a raster,
-else an id. Where polygons overlap, the later feature covers the earlier one, as drawn. A map pixel has the class of the polygon that
-contains its centre; ground outside all polygons has no data.
+The property is a class name of the class table (case, '_' and '-' do not matter), or a number: a value of the table, as
+in a raster, else an id. Where polygons overlap, the later feature covers the earlier one, as drawn. A map pixel has the
+class of the polygon that contains its centre; ground outside all polygons has no data.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _TOGETHER = 32
 """Polygons that are compared with all others at one time."""
 
 _DETAILED = 10_000
-"""A polygon of more vertices is cut to the part of the map that it is burnt into: each row of pixels looks at every edge."""
+"""Most vertices of a polygon before it is cut to the burnt part of the map: each pixel row visits every edge."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +95,8 @@ def is_drawn(paths: Sequence[Path]) -> bool:
 def place_polygons(paths: Sequence[Path], scheme: ClassScheme, crs: CRS, grid: MapGrid) -> PolygonLayer:
     """Read terrain polygons and project them to the CRS of a map's grid; later features lie on top.
 
-    `MapError`: not GeoJSON, another CRS, invalid geometry, a class that the table does not have, or nothing on the map: all problems at
-    once.
+    `MapError`: not GeoJSON, another CRS, invalid geometry, a class that the table does not have, or nothing on the map:
+    all problems at once.
     """
     every, problems = _read_all(paths)
     features = [feature for feature in every if feature.polygons and _find_class(feature) is not None] or every
@@ -143,7 +143,7 @@ def _find_class(feature: PolygonFeature) -> Any:
 
 
 def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str], numbers: set[int]) -> int:
-    """Return a feature's class id; 0, and a line in ``problems``, if it has none. A number in place of a name is added to ``numbers``."""
+    """Return a feature's class id; 0 and a line in ``problems`` without one. Numeric names are added to ``numbers``."""
     given = _find_class(feature)
     if given is None:
         there = shorten_value(", ".join(sorted(feature.properties)) or "none")[1:-1]
@@ -196,7 +196,7 @@ def _project_polygons(
 
 
 def _find_overlaps(polygons: NDArray[np.object_], ids: Bytes, scheme: ClassScheme) -> tuple[Finding, ...]:
-    """Return how much ground polygons of different classes share; of very many, and of very detailed ones, not all are looked at."""
+    """Return the ground that polygons of different classes share; of many or detailed ones only some are compared."""
     tree, shared_m2, worst_m2, left = shapely.STRtree(polygons), 0.0, 0.0, _LOOKED_AT
     names: dict[str, str] = {}
     vertices = shapely.get_num_coordinates(polygons)

@@ -1,13 +1,14 @@
 """Time offsets between the stamps of a run's sensors, by what they measure of the same motion.
 
-Small offsets are states of the estimator, and steps of a clock are hypotheses of it. Larger offsets are found before fusion. Two signals of
-one motion are shifted against each other until one explains most of the other (`motions`): yaw rates, speeds, accelerations.
-They are compared only where the robot turns or changes its speed: on a straight there is nothing to compare but what the controller
-corrects, and that leads the body. The course of fixes is not compared with the gyroscope: an antenna ahead of the turning point by l leads
-the body's course by l / v, 0.1 s for 10 cm.
+Small offsets are states of the estimator, and steps of a clock are hypotheses of it. Larger offsets are found before
+fusion. Two signals of one motion are shifted against each other until one explains most of the other (`motions`): yaw
+rates, speeds, accelerations. They are compared only where the robot turns or changes its speed: on a straight there is
+nothing to compare but what the controller corrects, and that leads the body. The course of fixes is not compared with
+the gyroscope: an antenna ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
 
-The pairs together, in windows of at most ten minutes, give each sensor's offset and drift from the clock that most of them share. A
-sensor is blamed only where two others agree against it and no pair contradicts. Clocks up to five minutes apart are found first.
+The pairs together, in windows of at most ten minutes, give each sensor's offset and drift from the clock that most of
+them share. A sensor is blamed only where two others agree against it and no pair contradicts. Clocks up to five minutes
+apart are found first.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ NOTED_S = 0.05
 _MIN_EXPLAINED = 0.25
 """Least share of a signal's variance that another one on the right clock explains: noise and slip are the rest."""
 _WINDOW_NS, _MIN_WINDOWS = (40_000_000_000, 600_000_000_000), 3
-"""Least and most time in which a clock does not drift [ns], a fifth of the run in between, and how many of these show a drift."""
+"""Least and most time without drift [ns], a fifth of the run in between, and number of them that show a drift [1]."""
 _DRIFT_STD = 1e-3  # standard deviation of a clock's drift before the run shows it [1]: ten times that of a quartz
 _COARSE_STD_S = 0.1  # standard deviation of an offset by the coarse search [s]
 
@@ -85,8 +86,8 @@ def find_clock_offsets(m: Measurements, *, clock_epoch: int = 0) -> ClockFacts:
 def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, ClockOffset]:
     """Return by role the time offset of each sensor from the largest group of sensors that share a clock.
 
-    Offsets that the fine search cannot find are noted. Without such an offset it returns {}, unless ``always``. Sensors whose offset is
-    unknown are missing.
+    Offsets that the fine search cannot find are noted. Without such an offset it returns {}, unless ``always``. Sensors
+    whose offset is unknown are missing.
     """
     coarse = find_coarse_offsets(m)
     if not always and not any(offset.noted for offset in coarse.values()):
@@ -102,7 +103,7 @@ def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, Clo
 
 
 def find_coarse_offsets(m: Measurements) -> dict[str, ClockOffset]:
-    """Return how late sensors' stamps are, roughly, against those of the largest group that shares a clock, of which one is at 0.
+    """Return approximate delays of sensors' stamps against the largest group that shares a clock, with one at 0.
 
     Offsets that the fine search cannot find are noted. Returns {} if the pairs of sensors contradict each other.
     """
@@ -158,7 +159,7 @@ def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float,
 
 
 def make_pair(late: str, against: str, by: str, lag: Lag) -> ClockPair:
-    """Return two sensors compared; a lag is determined to 0.02 s or a tenth of it: the mean of a clock that steps has a larger σ."""
+    """Return a comparison of two sensors; a determined lag has σ below 0.02 s or a tenth: a stepping clock has more."""
     std_s = max(lag.std_s, 0.02 if by == "acceleration" else 1e-3)  # slopes act on accelerometers
     determined = std_s <= max(0.02, 0.1 * abs(lag.offset_s)) and lag.explained >= _MIN_EXPLAINED
     return ClockPair(late, against, by, lag.offset_s, std_s, lag.explained, determined)
@@ -186,7 +187,7 @@ def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tupl
 
 
 def _select_near(lively: Floats, values: Signal) -> Signal:
-    """Return values within 2 s of rows in which another signal [rad/s] or [m/s] is beyond 0.1, NaN elsewhere, shape (M,)."""
+    """Return values within 2 s of rows in which another signal [rad/s] or [m/s] is beyond 0.1, else NaN, (M,)."""
     is_near = compute_moving_mean(1.0 * (np.abs(lively) > 0.1), round(2.0 / GRID_S), least=0.0) > 0.0
     return np.where(is_near, values, np.nan)
 
@@ -206,9 +207,10 @@ def solve_offsets(
     near_s: float = NOTED_S,
     roles: Sequence[str] = ROLES,
 ) -> ClockFacts:
-    """Return each sensor's offset from the clock that most sensors share, by weighted least squares over the pairs that are determined.
+    """Return each sensor's offset from the clock of most sensors, by weighted least squares over determined pairs.
 
-    Clocks within ``near_s`` are one. Where as many agree with either of two, that of the first of ``roles`` is taken for the right one.
+    Clocks within ``near_s`` are one. Where as many agree with either of two, that of the first of ``roles`` is taken
+    for the right one.
     """
     known = [pair for pair in pairs if pair.determined]
     solved = {
@@ -234,7 +236,7 @@ def solve_offsets(
 
 
 def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) -> dict[str, ClockOffset]:
-    """Return offset and drift of each sensor that pairs connect to the reference; no drift unless windows determine it."""
+    """Return offset and drift of each sensor that pairs connect to the reference; drift only if windows show it."""
     connected = _find_connected(reference, pairs)
     used = [pair for pair in pairs if pair.late in connected]
     free = [role for role in ROLES if role in connected and role != reference]

@@ -1,10 +1,10 @@
-"""Motion by each sensor of a set on a common grid of time: speed, yaw rate, acceleration and places; and lags between them.
+"""Motion by each sensor on a common grid of time: speed, yaw rate, acceleration and places; and lags between them.
 
 The time offset of one signal against another, and the factor between them, come from their correlation at every lag.
-Signals are real, or complex for vectors in the plane, NaN where unknown: masked normalised cross-correlation by FFT (Padfield, CVPR 2010).
-The lag at which one signal explains most of the other's variance is the offset, refined by a parabola. Its standard deviation is that of
-the delete-a-group jackknife (Miller 1974, Biometrika 61), which needs no model of the residuals. The coarse search, over minutes, is by
-speed and turn rate together.
+Signals are real, or complex for vectors in the plane, NaN where unknown: masked normalised cross-correlation by FFT
+(Padfield, CVPR 2010). The lag at which one signal explains most of the other's variance is the offset, refined by a
+parabola. Its standard deviation is that of the delete-a-group jackknife (Miller 1974, Biometrika 61), which needs no
+model of the residuals. The coarse search, over minutes, is by speed and turn rate together.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FIXES_S = 0.5
 """A velocity is made of fixes averaged over, and taken apart by, this long [s]: their noise is below the motion."""
 
 SMOOTH_S, _ACCELERATION_S, _SLOW_S = 0.1, 0.3, 4.0
-"""Times over which speeds and yaw rates are averaged, and accelerations; slower changes are also slip and slopes [s]."""
+"""Averaging times of speeds and yaw rates, and of accelerations; slower changes are also slip and slopes [s]."""
 
 
 def make_grid_ns(first_ns: int, last_ns: int) -> Ints:
@@ -52,7 +52,7 @@ def find_span_ns(m: Measurements) -> tuple[int, int] | None:
 
 
 def iterate_windows_ns(m: Measurements, length_ns: int) -> Iterator[Ints]:
-    """Yield grids [ns] of about ``length_ns`` that follow each other over the time of a set, wherever it has measurements."""
+    """Yield consecutive grids [ns] of about ``length_ns`` over the time of a set, where it has measurements."""
     span = find_span_ns(m)
     if span is None:
         return
@@ -88,7 +88,7 @@ def compute_driven_m(m: Measurements, at_ns: Ints) -> Floats:
 
 
 def resample_signal(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
-    """Return the means of the piecewise-linear signal (N, k) over each grid cell, shape (M, k); NaN outside and in gaps.
+    """Return the means of the piecewise-linear signal (N, k) over grid cells, shape (M, k); NaN outside and in gaps.
 
     A gap is longer than half a second and than three periods.
     """
@@ -102,7 +102,7 @@ def resample_signal(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
 
 
 def resample_twist(source: BodyVelocities, at_ns: Ints) -> Floats:
-    """Return forward velocity and yaw rate, shape (M, 2), single wild samples bridged; the yaw rate 0 where the source gives none."""
+    """Return forward velocity and yaw rate (0 if not measured), shape (M, 2), with single wild samples bridged."""
     twist = np.column_stack((source.velocity_mps[:, 0], source.yaw_rate_radps))
     if not np.isfinite(twist[:, 1]).any():
         twist[:, 1] = 0.0
@@ -111,7 +111,7 @@ def resample_twist(source: BodyVelocities, at_ns: Ints) -> Floats:
 
 
 def resample_fixes(gnss: Positions, at_ns: Ints) -> Plane:
-    """Return the antenna's places [m], east and i times north, averaged over half a second, shape (M,); wild fixes are bridged."""
+    """Return the antenna's places [m], east + i north, averaged over half a second, shape (M,), without wild fixes."""
     places = remove_wild_places(gnss.position_enu_m).view(np.float64).reshape(-1, 2)
     return average(resample_signal(gnss.stamp_ns, places, at_ns) @ np.array([1.0, 1j]), FIXES_S)
 
@@ -139,7 +139,7 @@ def _differentiate(values: Signal, subtract: Callable[[Signal, Signal], Signal])
 
 
 def resample_imu(imu: InertialMeasurements, at_ns: Ints) -> tuple[Floats, Plane, Floats]:
-    """Return yaw rate and quick horizontal specific force (forward, i times left), shape (M,) each, and the rotation (3, 3) that levels.
+    """Return yaw rate, quick horizontal force (forward + i left), (M,) each, and the levelling rotation (3, 3).
 
     The unit is levelled by the mean direction of its force where this contains gravity.
     """
@@ -153,7 +153,7 @@ def resample_imu(imu: InertialMeasurements, at_ns: Ints) -> tuple[Floats, Plane,
 
 
 def compute_acceleration(twist: Floats) -> Plane:
-    """Return the quick part of the acceleration of a twist [m/s²], forward and, by its turns, i times left, shape (M,)."""
+    """Return the quick part of the acceleration of a twist [m/s²], forward + i left (by its turns), shape (M,)."""
     speed = average(twist[:, 0], _ACCELERATION_S)
     return find_quick_part(np.gradient(speed, GRID_S) + 1j * speed * average(twist[:, 1], _ACCELERATION_S))
 
@@ -170,7 +170,7 @@ def find_quick_part(values: Signal) -> Signal:
 
 
 def dead_reckon(twist: Floats) -> Plane:
-    """Return the path [m] of a twist (M, 2), from the origin along the real axis, shape (M,); NaN where the twist is unknown."""
+    """Return the path [m] of a twist (M, 2) from the origin along the real axis, shape (M,); NaN if unknown."""
     known = np.asarray(np.isfinite(twist).all(1))
     forward_mps, yaw_rate_radps = np.where(known[:, None], twist, 0.0).T
     at_s: Floats = GRID_S * np.arange(len(twist), dtype=np.float64)
@@ -185,15 +185,16 @@ _STEPS = round(MAX_LAG_S / GRID_S)
 _GROUPS, _MIN_GROUPS, _MIN_GROUP_S = 20, 4, 2.0
 """Most and fewest groups of time of the jackknife, and their least length [s]."""
 _INDEPENDENT = 10
-"""Rows between independent residuals: signals are smoothed over 0.1 s to 0.2 s, those of the coarse search over 1 s, which is 5 rows."""
+"""Rows between independent residuals: signals are smoothed over 0.1 s to 0.2 s; of the coarse search over 5 rows."""
 _TINY = 1e-12  # least variance, and least share of it, that a division bears
 
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """How much later the target's stamps are than the regressor's [s], its standard deviation, the variance explained (0 to 1).
+    """Delay of the target's stamps against the regressor's [s], its standard deviation, explained variance (0 to 1).
 
-    The target is ``factor`` times the regressor; that of vectors in the plane is complex, its angle turns the regressor into the target.
+    The target is ``factor`` times the regressor; that of vectors in the plane is complex, its angle turns the regressor
+    into the target.
     """
 
     offset_s: float
@@ -208,17 +209,18 @@ class Lag:
 def find_lag(target: Signal, regressor: Signal) -> Lag | None:
     """Return how late the target's stamps are against the regressor's, or None where that is unknown.
 
-    Signals, shape (M,), are on a grid of `GRID_S`. The lag is unknown where few values are, where the best lag is at the end of the search
-    or another is as good, or where a constant explains the target.
+    Signals, shape (M,), are on a grid of `GRID_S`. The lag is unknown where few values are, where the best lag is at
+    the end of the search or another is as good, or where a constant explains the target.
     """
     sums = compute_lag_sums(target, regressor)
     return None if sums is None else estimate_lag([sums])
 
 
 def compute_lag_sums(target: Signal, regressor: Signal) -> Plane | None:
-    """Return sums over a target y and a regressor x of a window, shape (M,), by groups of time of equal length and lags.
+    """Return sums over target y and regressor x of a window, shape (M,), by groups of equal time and lags.
 
-    They are of 1, x, |x|², conj(y), conj(y) x and |y|² where both are known, shape (6, G, L). None where the window is too short.
+    They are of 1, x, |x|², conj(y), conj(y) x and |y|² where both are known, shape (6, G, L). None where the window is
+    too short.
     """
     groups = min(_GROUPS, int((target.size - 2 * _STEPS) * GRID_S / _MIN_GROUP_S))
     if groups < _MIN_GROUPS:
@@ -235,7 +237,7 @@ def compute_lag_sums(target: Signal, regressor: Signal) -> Plane | None:
 
 
 def estimate_lag(windows: Sequence[Plane]) -> Lag | None:
-    """Return the lag of several windows of time together; ``windows`` are of `compute_lag_sums`, of the same signals."""
+    """Return the lag of several windows together; ``windows``: `compute_lag_sums` of the same signals."""
     sums = np.concatenate(windows, axis=1)
     together = -(-sums.shape[1] // (2 * _GROUPS))  # fewer, longer groups
     sums = np.add.reduceat(sums, np.arange(0, sums.shape[1], together), axis=1)
@@ -254,7 +256,7 @@ def estimate_lag(windows: Sequence[Plane]) -> Lag | None:
 
 
 def _explain_target(sums: Plane) -> tuple[Floats, Plane]:
-    """Return how much of a target's variance its regressor explains, 0 where one does not vary, and the factor, shape (G, L) each."""
+    """Return the share of a target's variance that its regressor explains (0 if constant), and the factor, (G, L)."""
     n, x, xx, y, yx, yy = sums
     count = np.maximum(np.rint(n.real), 1.0)
     target, regressor = yy.real - np.abs(y) ** 2 / count, xx.real - np.abs(x) ** 2 / count
@@ -266,7 +268,7 @@ def _explain_target(sums: Plane) -> tuple[Floats, Plane]:
 
 
 def _find_peak(values: Floats) -> float:
-    """Return the rows from the middle to the maximum, by a parabola through its neighbours; NaN at the end of the search."""
+    """Return the rows from the middle to the maximum, by a parabola through its neighbours; NaN at the ends."""
     best = int(np.argmax(values))
     if best in {0, values.size - 1}:
         return float("nan")
@@ -291,7 +293,7 @@ NEAR_S = MAX_LAG_S - _COARSE_S
 
 
 def prepare_coarse_signals(speed_mps: Floats, turn_radps: Floats) -> Floats:
-    """Return speed and turn rate for `find_coarse_lag`, shape (2, N): means over 1 s less those over 30 s, 0 where unknown."""
+    """Return speed and turn rate for `find_coarse_lag`, (2, N): means over 1 s less those over 30 s, 0 if unknown."""
     rows = np.stack((speed_mps, turn_radps))[:, : speed_mps.size // 10 * 10].reshape(2, -1, 10).mean(2).T
     smooth = np.where(np.isfinite(rows), compute_moving_mean(rows, 2, least=0.0), np.nan)
     quick: Floats = np.nan_to_num(smooth - compute_moving_mean(smooth, 75, least=0.0)).T
@@ -299,7 +301,7 @@ def prepare_coarse_signals(speed_mps: Floats, turn_radps: Floats) -> Floats:
 
 
 def find_coarse_lag(late: Floats, against: Floats) -> float | None:
-    """Return how much later the stamps of one sensor are than another's [s], None where this is unknown; signals of shape (2, N)."""
+    """Return the delay of one sensor's stamps against another's [s], None if unknown; signals have shape (2, N)."""
     most = round(300.0 / _COARSE_S)  # five minutes
     size = 1 << (late.shape[1] + most).bit_length()
     spectra = np.fft.rfft(late, size) * np.conj(np.fft.rfft(against, size))

@@ -1,8 +1,9 @@
 """Sensors that cannot be right: frozen, too slow, in another unit, mounted otherwise, or unlike the other sensors.
 
-Sensors are compared in pairs by three quantities: the distance that they drive, how they turn, and whether they drive forward. Of two that
-differ, the one that fewer others confirm is excluded; both are, on a tie. Two facts need no second sensor of motion: gravity shows the tilt
-of an IMU, and the size of its specific force the unit. An odometry's accelerations show the yaw of an IMU.
+Sensors are compared in pairs by three quantities: the distance that they drive, how they turn, and whether they drive
+forward. Of two that differ, the one that fewer others confirm is excluded; both are, on a tie. Two facts need no second
+sensor of motion: gravity shows the tilt of an IMU, and the size of its specific force the unit. An odometry's
+accelerations show the yaw of an IMU.
 
 Nothing else is decided before fusion: a section that its sensors do not explain is doubted as a whole afterwards.
 """
@@ -53,7 +54,7 @@ _CONTRADICTIONS = {
     "turn": ("yaw-rate-sign", (0.0, np.inf), np.diag([1.0, -1.0, -1.0])),
     "direction": ("drives-backwards", (0.0, np.inf), np.diag([-1.0, -1.0, 1.0])),
 }
-"""By quantity: code of the finding, ratios of two sensors that agree [1], and the rotation that sets an odometry right."""
+"""By quantity: code of the finding, ratios of sensors that agree [1], and the rotation that corrects an odometry."""
 CONSTANT_FAULTS = frozenset({"drives-backwards", "imu-rotated", "imu-units", "yaw-rate-sign"})
 """Codes of exclusions for units and mounting, which no restart of a clock changes."""
 
@@ -85,7 +86,7 @@ Exclusions = dict[str, SensorExclusion]
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Commands of a clock epoch: stamps [ns], forward velocity [m/s] and yaw rate [rad/s], in order, shape (N,) each."""
+    """Commands of a clock epoch: stamps [ns], forward velocity [m/s] and yaw rate [rad/s], sorted, shape (N,) each."""
 
     stamp_ns: NDArray[np.int64]
     forward_velocity_mps: Floats
@@ -98,8 +99,10 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
     Parameters
     ----------
     m : measurements in base_link axes, by the extrinsics in use.
-    is_imu_stated : whether the extrinsics of the IMU are stated (recipe, transforms, message in base_link) rather than assumed.
-    felt : median size of the specific force as the IMU measured it, before its lever arm was taken out; NaN without an IMU.
+    is_imu_stated : whether the extrinsics of the IMU are stated (recipe, transforms, message in base_link) rather than
+    assumed.
+    felt : median size of the specific force as the IMU measured it, before its lever arm was taken out; NaN without an
+    IMU.
     """
     found: Exclusions = {}
     if m.imu is not None and (rate_hz := _find_slow_rate_hz(m.imu.stamp_ns)) is not None:
@@ -152,7 +155,7 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
 
 
 def _find_slow_rate_hz(stamp_ns: NDArray[np.int64]) -> float | None:
-    """Return the median rate of an IMU whose samples are mostly too far apart to show the motion between them; pauses do not count."""
+    """Return the median rate of an IMU whose samples are mostly too rare to show the motion, without pauses."""
     step_s = np.diff(stamp_ns) * 1e-9
     known_s = step_s[step_s <= PAUSE_NS * 1e-9]
     # 10 Hz, with the jitter of its driver.
@@ -161,7 +164,7 @@ def _find_slow_rate_hz(stamp_ns: NDArray[np.int64]) -> float | None:
 
 
 def _list_constants(m: Measurements) -> Iterator[tuple[str, str, int]]:
-    """Yield the sensors of which a quantity is the same to the last digit throughout, the quantity, and the number of messages."""
+    """Yield sensors with a quantity that is constant to the last digit, the quantity, and the number of messages."""
     values = [(role, "velocity", source.velocity_mps) for role, source in m.odometries().items()]
     values += [] if m.gnss is None else [(GNSS, "position", m.gnss.position_enu_m)]
     if m.imu is not None:
@@ -184,7 +187,7 @@ def _find_yaws(force: Plane, twists: Mapping[str, Floats]) -> dict[str, float]:
 
 
 def _check_units(turn: Floats, ratios: Sequence[float], felt: float) -> SensorExclusion | None:
-    """Return the exclusion of an IMU in other units, by the yaw rates of others over its own, or its size, and the median force."""
+    """Return the exclusion of an IMU in other units, by the ratios of others' yaw rates to its, and the force."""
     names, numbers = [], dict[str, float]()
     rate_radps = np.abs(turn[np.isfinite(turn)])
     if ratios and np.median(ratios) < 1.0 / 15.0:  # 1/57 in degrees
@@ -199,7 +202,7 @@ def _check_units(turn: Floats, ratios: Sequence[float], felt: float) -> SensorEx
 
 
 def _check_mounting(level: Floats, yaws_rad: Mapping[str, float]) -> SensorExclusion | None:
-    """Return the exclusion of an IMU that the rotation by which gravity levels it shows to be tilted, or accelerations to look aside."""
+    """Return the exclusion of an IMU that is tilted by the rotation that levels it, or looks aside by accelerations."""
     tilt_rad = float(np.arccos(np.clip(level[2, 2], -1.0, 1.0)))
     by_gravity = tilt_rad > np.radians(30.0)  # slopes average out, and the steepest that is driven is 22.5°
     is_aside = yaws_rad and all(abs(np.cos(each)) < 0.5 for each in yaws_rad.values())
@@ -213,7 +216,7 @@ def _check_mounting(level: Floats, yaws_rad: Mapping[str, float]) -> SensorExclu
 
 
 def find_nearest_mounting(base_from_sensor: Floats) -> Floats:
-    """Return the rotation (3, 3) with axes along axes that is nearest, or the given one where none is within about 14°."""
+    """Return the nearest rotation (3, 3) with axes along axes, or the given one if none is within about 14°."""
     aligned = np.round(base_from_sensor)
     return aligned if np.abs(aligned - base_from_sensor).max() < 0.25 else base_from_sensor
 
@@ -221,7 +224,7 @@ def find_nearest_mounting(base_from_sensor: Floats) -> Floats:
 # Comparisons
 
 Ratios = dict[tuple[str, str], float]
-"""By two sensors, how many times as large a quantity of the second is as that of the first, negative for the other sign [1]."""
+"""Ratio of a quantity of two sensors, second over first, negative for the other sign [1]."""
 _MAX_SCALE = 5.0
 """Ratio of distances up to which an odometry has another scale; beyond it the two have nothing in common [1]."""
 
@@ -232,7 +235,7 @@ def _compute_noise_m2(gnss: Positions | None) -> float:
 
 
 def compute_distance_ratio(a: Plane, b: Plane, noise_m2: float) -> float | None:
-    """Return how many times as far as path a path b goes, in windows as short as the noise of fixes allows; None if neither moves."""
+    """Return the length of path b over path a, in windows as short as the noise of fixes allows; None if both stand."""
     step_s = 0.5  # between places that are compared
     both = np.stack((a, b))[:, :: round(step_s / GRID_S)]
     for window_s in (20.0, 60.0, 180.0):
@@ -253,7 +256,7 @@ _MIN_CORRELATION = 0.7
 
 
 def _compare_signals(signals: Mapping[str, Floats], *, centred: bool = False) -> Ratios:
-    """Return the factors between signals on the grid (M,) that correlate where both are known, ``centred`` without their means."""
+    """Return the factors between correlated signals on the grid (M,); ``centred``: without their means."""
     ratios = {}
     for a, b in combinations(signals, 2):
         both = np.stack((signals[a], signals[b]))
@@ -276,8 +279,9 @@ def _exclude(
 ) -> None:
     """Exclude of each pair that differs the sensor that fewer confirm; both on a tie.
 
-    ``trust`` counts as confirmations. Fixes are right about the scale of an odometry that no other confirms. Of two sensors whose distances
-    have nothing in common, turns that agree with those of others, the pairs ``turning``, confirm one as well.
+    ``trust`` counts as confirmations. Fixes are right about the scale of an odometry that no other confirms. Of two
+    sensors whose distances have nothing in common, turns that agree with those of others, the pairs ``turning``,
+    confirm one as well.
     """
     code, (low, high), turned_by = _CONTRADICTIONS[quantity]
     same = [pair for pair, ratio in ratios.items() if low <= ratio <= high]

@@ -1,1 +1,1 @@
-"""From labelled segments and maps to a dataset: what goes in, what it covers, how it is split, and how it is written."""
+"""From labelled segments and maps to a dataset: its inputs, its coverage, its splits, and its files."""

@@ -105,10 +105,12 @@ class BuildResult:
 def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
 
-    Findings on damaged runs (which are excluded), runs to be ingested again, runs that only the replaced dataset has, and empty splits make
-    the exit code 3, unless the call before has reported them. The bytes do not depend on ``jobs``.
+    Findings on damaged runs (which are excluded), runs to be ingested again, runs that only the replaced dataset has,
+    and empty splits make the exit code 3, unless the call before has reported them. The bytes do not depend on
+    ``jobs``.
 
-    Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
+    Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written
+    then.
     """
     refuse_import_of_script(options.jobs)
     out = options.out
@@ -176,7 +178,7 @@ def _read_job(state: State, store: Store, options: BuildDatasetOptions, place: L
 def _build(
     call: RunningCall, options: BuildDatasetOptions, place: Location, *, reported: Collection[str]
 ) -> tuple[BuildResult, ChosenInputs]:
-    """Write the dataset, unless it is there; return the result and its inputs. ``reported`` are findings that are known."""
+    """Write the dataset unless it exists; return the result and its inputs. ``reported``: findings already printed."""
     if isinstance(place, Path):
         clear_beside(place)
     job = _read_job(call.state, call.store, options, place)
@@ -217,7 +219,7 @@ _IN_PYTHON = "a recipe in Python"
 
 
 def find_changed_parts(store: Store, state: State, output: Output) -> str:
-    """Return which parts of a dataset would be others if it were built now, or why it cannot be planned; "" if nothing would change.
+    """Return the parts of a dataset that a build would change now, or why it cannot be planned; "" without a change.
 
     A dataset whose recipe was given in Python is taken for unchanged.
     """
@@ -300,14 +302,14 @@ def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
 def _make_result(
     place: Location, status: str, card: DatasetCard, left_out: Sequence[Finding], reported: Collection[str]
 ) -> BuildResult:
-    """Return the result, with today's findings on excluded runs in place of the card's; those ``reported`` before are no news."""
+    """Return the result, with today's findings on excluded runs instead of the card's, without those ``reported``."""
     findings = (*left_out, *(finding for finding in card.findings if finding.code not in CHOICE_CODES))
     is_news = any(_name_finding(finding) not in reported for finding in select_problems(findings))
     return BuildResult(str(place), status, findings, card, 3 if is_news else 0)
 
 
 def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
-    """Return the card of the dataset in a directory, if there is one, and whether it is intact; `DatasetError` for anything else."""
+    """Return the card of a directory's dataset, if any, and whether it is intact; `DatasetError`: other content."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None, False
     if not place.is_dir():

@@ -57,7 +57,7 @@ CARD_COLUMNS = ("run_id", "robot", "split", "fold", "terrain_name", "quality", *
 def measure_repeatability(
     samples: pa.Table, xy_m: Floats, *, velocity_column: str, chord_m: float
 ) -> dict[str, Floor | None]:
-    """Return how well each label repeats itself; ``samples`` has `REPEATABILITY_COLUMNS`, ``xy_m`` are their centres [m], shape (N, 2)."""
+    """Return the repeatability of each label; ``samples``: `REPEATABILITY_COLUMNS`, ``xy_m``: centres [m], (N, 2)."""
     slope_rad = np.nan_to_num(to_floats(samples, "slope_rad"))  # unknown without patches
     terrain = samples.column("terrain_class").fill_null(0).to_numpy()
     repeated = find_repeated_pairs(xy_m, to_floats(samples, "course_rad"), terrain, chord_m=chord_m)

@@ -63,7 +63,8 @@ logger = logging.getLogger("tcpipe")
 class SampleTable:
     """The samples in the dataset's order, made piece by piece: their segments are mapped from a file, not in memory.
 
-    Row i is patch ``patch[i]`` of ``sampled``, whose pixels are in ``slot`` of the spool; ``assigned`` is in the patches' order.
+    Row i is patch ``patch[i]`` of ``sampled``, whose pixels are in ``slot`` of the spool; ``assigned`` is in the
+    patches' order.
     """
 
     segments: pa.Table
@@ -248,7 +249,7 @@ def gather_content(directory: Path, inputs: ChosenInputs, options: BuildOptions,
 
 
 def _choose_plane(segments: pa.Table, sources: Sequence[MapFile]) -> Projection | None:
-    """Return the projection from WGS 84 to the plane of the footprints: the first map's, or the UTM zone of the first segment.
+    """Return the projection from WGS 84 to the footprints' plane: the first map's, or the first segment's UTM zone.
 
     None: the runs have no positions on Earth.
     """
@@ -317,7 +318,7 @@ def write_patches(
     *,
     compression: Compression,
 ) -> list[Shard]:
-    """Write the layers, shard by shard; return the shards if the format has any. Without patches, Parquet shards have samples alone."""
+    """Write the layers by shard; return the shards, if any. Without patches, Parquet shards have samples alone."""
     samples, spool = content.samples, content.spool
     if not spool.layers and file_format == "zarr":
         return []
@@ -352,8 +353,8 @@ def make_added_columns(
 ) -> tuple[pa.Table, tuple[Covariate, ...], list[Finding]]:
     """Return the added columns of all segments, M rows, the covariates for the card, and findings.
 
-    A covariate is that of a segment's start; ``kept`` are the rows that are samples, (N,). `DatasetError` if a column has the name of
-    another one or of one of ``layers``.
+    A covariate is that of a segment's start; ``kept`` are the rows that are samples, (N,). `DatasetError` if a column
+    has the name of another one or of one of ``layers``.
     """
     table, findings = _make_tag_columns(segments.column("run_id"), runs)
     covariates = list[Covariate]()
@@ -410,7 +411,7 @@ def _make_tag_columns(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tu
 
 
 def read_tags(run_ids: Sequence[str], runs: Sequence[RunSource], rules: SplitConfig) -> dict[str, str] | None:
-    """Return the value of the holdout's tag by run, None with another holdout; `DatasetError` names the runs without it."""
+    """Return the value of the holdout's tag by run, None with other holdouts; `DatasetError` names runs without it."""
     if rules.holdout != "tag":
         return None
     key, tags = rules.holdout_tag, {run.run_id: (run.tags or {}).get(rules.holdout_tag) for run in runs}

@@ -1,6 +1,7 @@
 """Inputs of a dataset: runs and maps of a store, one hash over all, and how they differ from an earlier dataset's.
 
-Recordings that are in the store twice: one file under two names, or two recordings of one drive, whole or in part (ADR-18).
+Recordings that are in the store twice: one file under two names, or two recordings of one drive, whole or in part
+(ADR-18).
 """
 
 from __future__ import annotations
@@ -148,7 +149,7 @@ def _find_maps(store: Store, maps: Sequence[StoredMap]) -> tuple[tuple[Path, Fet
 
 
 def prove_maps(store: Store, maps: Sequence[StoredMap]) -> None:
-    """Compare the files of maps on disk with their documents; `MapError` if one was changed or lost, which would read as no data."""
+    """Compare the maps' files with their documents; `MapError` for a changed or lost file, which reads as no data."""
     root = store.place.path
     if root is None:  # what is read from a bucket is verified when it is fetched
         return
@@ -211,7 +212,7 @@ _OPTIONS = {
 
 
 def find_other_options(card: DatasetCard, options: BuildOptions, inputs: ChosenInputs) -> list[str]:
-    """Return a line with both values for each option of a build that differs from those of the dataset it would replace."""
+    """Return a line with both values for each build option that differs from those of the replaced dataset."""
     was, now = card.made_from, inputs.made_from
     if was.without_coordinates and now.without_coordinates:
         return ["--without-coordinates: maps, region, tags and recipe are not stored and cannot be compared"]
@@ -226,7 +227,7 @@ def find_other_options(card: DatasetCard, options: BuildOptions, inputs: ChosenI
 
 
 def _is_option(change: RecordChange, options: BuildOptions) -> bool:
-    """Return whether a change is of an option: a file may have other content, a store its first map, and the robot is that of the runs."""
+    """Return whether a change is of an option; contents of files, a first map and the runs' robot may change freely."""
     if change.path[0] == "covariates":
         return None in (change.was, change.now)
     if change.path[0] == "map_names":
@@ -243,7 +244,7 @@ def _format_option(change: RecordChange, was: DatasetInputs, now: DatasetInputs)
 
 
 def _format_field(field: str, record: DatasetInputs) -> str:
-    """Return the value of an option without the content of files: their names, whether there is one, the kinds of a region's polygons."""
+    """Return the value of an option without file contents: names, presence, the kinds of a region's polygons."""
     value = getattr(record, field)
     if field == "region" and value is not None:
         value = f"{' and '.join(value)} ({digest(value)[:8]})"
@@ -264,7 +265,7 @@ _WAYS = 64  # most runs whose positions are in memory
 
 @dataclass(frozen=True, slots=True)
 class UniqueRuns:
-    """Runs of which each drive is there once: ``again`` marks, by run, the segments that an earlier one in ``runs`` has too."""
+    """Runs with each drive only once: ``again`` marks, by run, the segments that an earlier run also has."""
 
     runs: tuple[StoredRun, ...]
     again: Mapping[str, Mask]
@@ -273,7 +274,7 @@ class UniqueRuns:
 
 @dataclass(frozen=True, slots=True)
 class _SegmentPositions:
-    """When and where a run's segments lie, in the order of its file, which is that of time: [ns], (N,), and lon, lat [deg], (N, 2)."""
+    """Times and places of a run's segments, in the order of its file (time): [ns], (N,), and lon, lat [deg], (N, 2)."""
 
     start_ns: Ints
     end_ns: Ints
@@ -356,7 +357,8 @@ _MIN_EQUAL_FRACTION, _MIN_VALUES = 0.5, 3
 def _is_one_drive(pair: tuple[StoredRun, StoredRun]) -> bool | None:
     """Return whether two runs at one time and place are of one drive, None if that is unknown.
 
-    One sensor with equal values proves one drive, other values of topics of one name prove two; else the tag ``robot`` decides.
+    One sensor with equal values proves one drive, other values of topics of one name prove two; else the tag ``robot``
+    decides.
     """
     files = [_find_streams(run) for run in pair]
     sensors = [run.facts.sensors for run in pair]
@@ -379,7 +381,7 @@ def _find_streams(run: StoredRun) -> dict[str, Path]:
 
 
 def _compute_equal_fraction(streams: Sequence[pa.Table]) -> float:
-    """Return the fraction of values, of those that occur once in the common time of two streams, which both have; NaN for few."""
+    """Return the fraction of the unique values in the common time of two streams that both have; NaN for few."""
     names = [field.name for field in streams[0].schema if pa.types.is_floating(field.type) and "_var" not in field.name]
     stamps = [to_integers(table, "stamp_ns") for table in streams]
     first_ns = max(stamp[0] for stamp in stamps) - _SAME_TIME_NS
@@ -416,7 +418,7 @@ def _find_shared(mine: _SegmentPositions, other: _SegmentPositions) -> Mask:
 def _find_overlapping(
     mine: _SegmentPositions, other: _SegmentPositions, *, slack_ns: int = 0, skew_ns: int = 0
 ) -> tuple[Mask, Ints]:
-    """Mark the segments whose middle half overlaps one of the other's in time, but for the slack, and that lie within 2 m of it.
+    """Mark segments whose middle half overlaps one of the other's in time, with slack, at most 2 m from it.
 
     The second array says how much later than that one they are [ns], once ``skew_ns`` is taken off.
     """

@@ -38,8 +38,8 @@ def register_runs(
 ) -> tuple[tuple[MapRegistration, ...], list[Finding]]:
     """Return the map's registration against each run that crosses enough of it, and findings on misfits.
 
-    Rows of a track count that are certain enough to be sampled. With ``sample.align`` a registration says whether its shift is applied, and
-    findings why not. `MapError` if the map's heights are in another unit than metres, or scaled.
+    Rows of a track count that are certain enough to be sampled. With ``sample.align`` a registration says whether its
+    shift is applied, and findings why not. `MapError` if the map's heights are in another unit than metres, or scaled.
     """
     projection = find_map_projection(source, recipe.read.gnss_crs)
     tracks = [_register(run, source, projection, recipe.sample) for run in runs]
@@ -85,7 +85,7 @@ class _Track:
         return "heights differ" if _is_other_ground(self.found.shape_misfit_m, self.expected_m) else ""
 
     def find_obstacle(self, max_std_m: float) -> str:
-        """Return why a shift cannot be applied; "" where it can: its DRMS and the track's together are at most ``max_std_m``."""
+        """Return why a shift cannot be applied, or "" if its DRMS and the track's together are within ``max_std_m``."""
         found = self.found
         if found is None or self.find_misfit():
             return self.find_misfit()
@@ -192,9 +192,10 @@ _Rows = Floats
 def find_contradictions(
     runs: Sequence[StoredRun], segments: pa.Table, sampled: Sampled, map_names: Sequence[str], config: SampleConfig
 ) -> tuple[NDArray[np.uint32], list[Finding]]:
-    """Return `Quality.MAP_CONTRADICTS_TRACK` or 0 of each patch, shape (N,), and findings on the largest clusters of such patches.
+    """Return `Quality.MAP_CONTRADICTS_TRACK` or 0 of each patch, shape (N,), and findings on their largest clusters.
 
-    Slope, cross slope and heights along the middle of patches are compared run by run; runs without heights and attitude flag nothing.
+    Slope, cross slope and heights along the middle of patches are compared run by run; runs without heights and
+    attitude flag nothing.
     """
     motion = np.stack([to_floats(segments, name)[sampled.kept] for name in _MOTION])
     patches, (rear_m, centre_m, front_m) = sampled.patches, sampled.patches.profile_m.T
@@ -213,10 +214,10 @@ def find_contradictions(
 
 
 def _compare_ground(motion: _Rows, ground: _Rows, *, has_attitude: bool) -> _Rows:
-    """Return how slope, cross slope [rad], rise and bulge [m] of a run's patches differ from the track, shape (4, N); 0 within limits.
+    """Return how slope, cross slope [rad], rise and bulge [m] of patches differ from the track, (4, N); 0 in limits.
 
-    The track's climb or its pitch counts, whichever is nearer to the map: a jump of the fixes is no error of the map. The mounting error
-    of the IMU is a constant of the run.
+    The track's climb or its pitch counts, whichever is nearer to the map: a jump of the fixes is no error of the map.
+    The mounting error of the IMU is a constant of the run.
     """
     start_z_m, end_z_m, chord_m, pitch_rad, roll_rad, speed_mps = motion
     sign, has_height = np.where(speed_mps < 0.0, -1.0, 1.0), np.ptp(end_z_m) > _MIN_HEIGHT_CHANGE_M
@@ -235,7 +236,7 @@ def _compare_ground(motion: _Rows, ground: _Rows, *, has_attitude: bool) -> _Row
 
 
 def _find_clusters(rows: Ints, excess: _Rows, sampled: Sampled, maps: Sequence[str]) -> Iterator[Finding]:
-    """Yield findings on the largest clusters of patches ``rows``: place, size, and largest differences of slope and height."""
+    """Yield findings on the largest clusters of patches ``rows``: place, size, largest slope and height differences."""
     places = KDTree(np.column_stack([sampled.footprint_xy_m[rows].mean(axis=1), 1e9 * sampled.map_index[rows]]))
     near = places.sparse_distance_matrix(places, read_threshold(_CONTRADICTION, "max_gap_m"))
     cluster, most = connected_components(near)[1], int(read_threshold(_CONTRADICTION, "max_finding_count"))

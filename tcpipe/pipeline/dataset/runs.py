@@ -175,7 +175,7 @@ def find_gone_runs(
 
 
 def find_other_sensors(sensors: Mapping[str, Mapping[str, Sensor]]) -> list[str]:
-    """Return a line for each difference between runs, whose sensors are by role: another type, frame or namespace, or no role in common.
+    """Return a line for each difference between runs by role: type, frame or namespace, or no role in common.
 
     A role that a run lacks is no difference: a sensor may be off for a drive.
     """
@@ -200,7 +200,7 @@ def _format_sensors(sensors: Mapping[str, Sensor], roles: Iterable[str]) -> str:
 
 
 def _is_similar(one: Sensor, other: Sensor) -> bool:
-    """Return whether two sensors agree in type and frame, and not only their namespaces differ, as of /imu, /a/imu and /b/imu."""
+    """Return whether two sensors agree in type and frame, and not only in all but the namespace (/a/imu, /b/imu)."""
     a, b = one.topic.strip("/").split("/"), other.topic.strip("/").split("/")
     is_apart = a != b and (a[1:] == b or a == b[1:] or (a[1:] == b[1:] and len(a) > 1))
     kinds = ((each.type_name, each.frame_id.strip("/")) for each in (one, other))
@@ -214,7 +214,7 @@ _ENDS_DEG = [f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon",
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """Columns that a segment needs to become a sample, what a run without them lacks, and what a segment without them is lost to."""
+    """Columns that a sample needs, with what a run without one lacks, and the loss of a segment without one."""
 
     columns: Sequence[str]
     lack: str
@@ -230,7 +230,7 @@ class Need:
 
 
 def list_needs(runs: Sequence[StoredRun], labels: Sequence[str], *, has_patches: bool) -> list[Need]:
-    """Return what every sample needs: the labels that were asked for, or energy if a run has it; and a position on the map.
+    """Return what every sample needs: the requested labels, or energy if a run has it; and a position on the map.
 
     Without patches a position is needed if any run has one.
     """
@@ -248,10 +248,10 @@ def list_needs(runs: Sequence[StoredRun], labels: Sequence[str], *, has_patches:
 def pool_segments(
     runs: Sequence[StoredRun], directory: Path, needs: Sequence[Need], *, again: Mapping[str, Mask]
 ) -> tuple[pa.Table, dict[str, float], list[Finding]]:
-    """Return the segments that can become samples, mapped from a file in ``directory``, and metres by reason, which sum to the odometers.
+    """Return the segments that can become samples, mapped from a file in ``directory``, and metres by reason.
 
-    ``again`` marks, by run, the segments that another run has too, in the order of the run's file. `DatasetError` states what the runs
-    lack if no segment can become a sample.
+    ``again`` marks, by run, the segments that another run has too, in the order of the run's file. `DatasetError`
+    states what the runs lack if no segment can become a sample.
     """
     names = dict.fromkeys(name for run in runs for name in run.manifest.distance_by_reason_m)
     distance_by_reason_m = {
@@ -299,7 +299,7 @@ def _iterate_usable(
     lacks: dict[str, list[str]],
     lost: Mapping[Loss, list[float]],
 ) -> Iterator[pa.Table]:
-    """Yield each run's segments that can become samples; add what no segment of it has to ``lacks``, and lost metres to ``lost``."""
+    """Yield each run's segments that can become samples; add missing columns to ``lacks``, lost metres to ``lost``."""
     for run in runs:
         segments = run.segments()
         arc_m, usable = to_floats(segments, "arc_length_m"), np.ones(segments.num_rows, np.bool_)

@@ -1,4 +1,4 @@
-"""Sampling segments of all runs: batches of near segments in parallel, their pixels in a spool until the dataset is written."""
+"""Sampling of segments of all runs: near segments in parallel batches, pixels in a spool until they are written."""
 
 from __future__ import annotations
 
@@ -128,11 +128,11 @@ def sample_all_segments(
     jobs: int,
     directory: Path,
 ) -> tuple[Sampled, Ints, Spool]:
-    """Sample each of M segments from the first map with data for it; return the results, slots in the order of ``kept``, and the spool.
+    """Sample M segments, each from the first map with data for it; return results, slots in ``kept`` order, spool.
 
-    ``ranks`` give the dataset's order, uniform over 64 bits, shape (M,); ``gnss_crs`` is the CRS of the segments' positions,
-    ``shifts`` say for each map by how much runs are moved on it.
-    The results are arrays in files in ``directory``, pixels in files below it. `TcpipeError` if the map or the segments cannot be used.
+    ``ranks`` give the dataset's order, uniform over 64 bits, shape (M,); ``gnss_crs`` is the CRS of the segments'
+    positions, ``shifts`` say for each map by how much runs are moved on it. The results are arrays in files in
+    ``directory``, pixels in files below it. `TcpipeError` if the map or the segments cannot be used.
     """
     sources = [open_map(*arguments) for arguments in maps()]
     check_same_layers(sources)

@@ -41,9 +41,9 @@ def draw_splits(
 ) -> tuple[Assignment, SplitResult]:
     """Assign every patch of ``sampled`` to a split by its whole footprint, and audit the result.
 
-    ``projection`` leads from WGS 84 to the plane of the footprints; None: runs are in local frames, which no region can name.
-    ``regions`` are in WGS84 lon/lat; None: everything is train and test. ``tags`` have the holdout's tag by run. `DatasetError` if no
-    footprint is inside the region.
+    ``projection`` leads from WGS 84 to the plane of the footprints; None: runs are in local frames, which no region can
+    name. ``regions`` are in WGS84 lon/lat; None: everything is train and test. ``tags`` have the holdout's tag by run.
+    `DatasetError` if no footprint is inside the region.
     """
     rules, chord_m = recipe.split, recipe.segment.chord_m
     buffer_m = math.sqrt(2.0) * chord_m if rules.buffer_m is None else rules.buffer_m

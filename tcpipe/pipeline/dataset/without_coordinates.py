@@ -1,4 +1,4 @@
-"""Datasets without coordinates: metres and seconds from origins that are not stored, numbers for names, and a card of listed fields."""
+"""Datasets without coordinates: metres and seconds from unknown origins, numbers for names, a card of listed fields."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tcpipe.tables.levels import COORDINATES
 
 _ENDS = ("start", "end")
 _DIGITS = 4
-"""Digits of metres and radians: finer ones would show how the places differ from those of the chords, and so the latitude."""
+"""Digits of metres and radians: finer ones would show how places differ from chords, and so the latitude."""
 
 _DOCS = {
     "run_id": "number of the run",
@@ -111,7 +111,7 @@ class Publication:
         return replace(inputs, sources=runs)
 
     def make_card(self, card: DatasetCard) -> DatasetCard:
-        """Return the public card of a dataset whose content and inputs are converted; findings of maps become its own."""
+        """Return the public card of a dataset with converted content and inputs; findings of maps become its own."""
         of_maps = (finding for source in card.maps for finding in source.findings)
         names = {**self.runs, **{name: name for name in self.runs.values()}}
         findings = keep_public(dict.fromkeys((*card.findings, *of_maps)), names)

@@ -87,7 +87,7 @@ def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
 
 
 def _write_overviews(directory: Path, sources: Sequence[MapFile]) -> None:
-    """Write the page's pictures of the maps: photograph (or relief), relief and classes, as far as the maps have them."""
+    """Write the page's pictures of the maps: photograph (or relief), relief and classes, as far as they exist."""
     write_overview(directory / OVERVIEW, draw_maps(sources))
     layers = {layer for source in sources for layer in source.layers}
     if "ortho" in layers:
