@@ -4,10 +4,12 @@ import errno
 import json
 import os
 import signal
+import sys
 
 import pytest
 from installed_command import tcpipe
 
+from tcpipe.__main__ import main
 from tcpipe.cli import Terminated
 from tcpipe.errors import DatasetError, MapError, RecipeError, StoreError, UsageError
 from tcpipe.pipeline.ingest import IngestSummary
@@ -66,3 +68,20 @@ def test_the_summary_of_ingest_states_whether_the_same_call_may_succeed_later(ca
     (tmp_path / "log.mcap").touch()
     summary = json.loads(tcpipe("ingest", "log.mcap", "--json", cwd=tmp_path).stdout.splitlines()[-1])
     assert (summary["kind"], summary["transient"]) == ("summary", any(causes))
+
+
+class Interrupted:
+    """A finder during which the user presses Ctrl-C."""
+
+    def find_spec(self, name, *_):
+        if name == "tcpipe.cli":
+            raise KeyboardInterrupt
+
+
+def test_an_interrupt_while_the_command_line_is_loaded_ends_in_one_line(monkeypatch, capsys):
+    monkeypatch.delitem(sys.modules, "tcpipe.cli")
+    monkeypatch.setattr(sys, "meta_path", [Interrupted(), *sys.meta_path])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "tcpipe: interrupted before the command began\n"
