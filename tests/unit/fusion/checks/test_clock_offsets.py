@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tcpipe.fusion.checks import clock_offsets
 from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, make_pair, shift_stamps, solve_offsets
 from tcpipe.fusion.checks.motions import Lag
 from tcpipe.fusion.measurements import (
@@ -19,6 +20,14 @@ from tcpipe.tables.facts import ClockOffset
 
 def pair(late, against, offset_s, std_s=0.002, explained=0.9, *, by="speed"):
     return make_pair(late, against, by, Lag(offset_s, std_s, explained))
+
+
+@pytest.mark.parametrize(
+    ("lever_arm_m", "speed_mps"), [((0, 1, 0), 0.5), ((0, -1, 0), 1.5), ((1, 0, 0), 1.25**0.5), ((0, 0, 1), 1.0)]
+)
+def test_an_antenna_inside_a_turn_is_slower_and_one_outside_is_faster(lever_arm_m, speed_mps):
+    to_the_left = np.array([[1.0, 0.5]])
+    assert clock_offsets._compute_antenna_speed(to_the_left, lever_arm_m) == pytest.approx(speed_mps)
 
 
 def test_the_one_that_differs_is_the_one_that_is_late():
