@@ -1,8 +1,8 @@
 """Attitude of a pose from another program (LIO, SLAM, motion capture), in the ENU plane and in robot axes.
 
-A pose gives position and attitude of its sensor in one frame. Where the frame lies in a CRS, its axes are those of the
-grid: the positions in both frames show the angle between them. A sensor that nothing places is turned as the motion
-shows it: the robot drives forward, and is upright on the whole.
+A pose gives position and attitude of its sensor in one frame. If the frame belongs to a CRS, its axes are those of the
+grid, and positions in both frames show the angle between them. The mounting of a sensor with unknown extrinsics comes
+from the motion: the robot drives forward and is upright on average.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tcpipe.robust import MEDIAN_OF_SQUARES
 
 STATED_MOUNTING_STD_RAD, UNSTATED_MOUNTING_STD_RAD = 0.0175, 0.1
 _FEWEST = 20  # attitudes, and chords
-_CHORD_NS = 1_000_000_000
+_CHORD_NS = 1_000_000_000  # duration of a chord
 
 
 def add_attitude(
@@ -52,7 +52,7 @@ def add_attitude(
     # Scan matching and visual SLAM state none, or any; no localization is better than 3 mrad.
     stated = np.where(np.isfinite(variance_rad2), variance_rad2, 0.01**2)
     stated[:, :2] = stated[:, :2].mean(1, keepdims=True)  # of roll and pitch, whatever the yaw
-    variance = np.maximum(stated, np.maximum(shown, 0.003**2))
+    variance = np.maximum(stated, np.maximum(shown, 0.003**2))  # no localization is better [rad²]
     if np.ptp(matrix_from_quat(quat_xyzw[known])[:, 2], axis=0).max() < 1e-6:  # a pose in the plane has yaw alone
         variance[:, :2] = UNMEASURED_RAD2
     return replace(
@@ -86,6 +86,7 @@ def align_mounting(fixes: Positions, odometry: BodyVelocities | None, *, is_stat
     way = fixes.position_enu_m[last] - fixes.position_enu_m[first]
     length = np.linalg.norm(way, axis=1)
     turned = np.linalg.norm(rotation_vector_from_quat(multiply(invert(quat[first]), quat[last])), axis=1)
+    # Least length [m] and largest turn [rad] of a chord.
     straight = (length > 0.3) & (turned < 0.1) & (stamp_ns[last] - stamp_ns[first] < 2 * _CHORD_NS)
     if straight.sum() < _FEWEST:
         return without

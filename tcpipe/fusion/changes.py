@@ -248,7 +248,7 @@ def join_events(events: Sequence[Change]) -> tuple[Change, ...]:
         before = joined[-1] if joined and (joined[-1].kind, joined[-1].role) == (event.kind, event.role) else None
         if before is not None and before.last is None:
             rest = np.linalg.norm(np.add(before.impulse, event.impulse))
-            if rest < 0.4 * np.linalg.norm(before.impulse):
+            if rest < 0.4 * np.linalg.norm(before.impulse):  # share that the end of a change leaves [1]
                 joined[-1] = replace(before, last=event.first)
                 continue
         joined.append(event)
@@ -273,6 +273,7 @@ def find_excursions(residuals: Sequence[Residuals], noise: NoiseModel, ticks: Ti
     windows are farther beyond, there is a step.
     """
     size = ticks.stamp_ns.size
+    # Windows of 4 s or less are too short to compare.
     of_fixes = [each for each in residuals if GNSS in each.pair and each.time_s > 4.0]
     found = sorted(
         (run for pair in combinations(of_fixes, 2) for run in _find_excursion_runs(*pair, noise)), reverse=True

@@ -82,7 +82,7 @@ def reckon_dead(m: Measurements, start_ns: int, bias_radps: float) -> DeadReckon
     return DeadReckoning(stamp_s, forward_mps, yaw_s[order], rate[order])
 
 
-_GRID_S = 0.5
+_GRID_S = 0.5  # of the course
 """Time between two courses [s]."""
 
 
@@ -98,7 +98,7 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
     std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
     least_m = max(0.3, 3.0 * std_m)  # a shorter baseline shows no course
     values = remove_wild_places(gnss.position_enu_m).view(np.float64).reshape(-1, 2)
-    for window_s in (1.0, 2.0, 4.0, 8.0, 16.0):
+    for window_s in (1.0, 2.0, 4.0, 8.0, 16.0):  # baselines [s]
         rows = round(window_s / _GRID_S)
         if grid_s.size <= rows:
             return stamp_s[:1], np.zeros(1)
@@ -106,7 +106,7 @@ def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_n
         way = (means[rows:] - means[:-rows]) @ np.array([1.0, 1j])
         at_s = 0.5 * (grid_s[rows:] + grid_s[:-rows])
         moving = np.abs(way) > least_m
-        if moving.mean() > 0.3:
+        if moving.mean() > 0.3:  # share of usable baselines [1] (ruling)
             break
     if odometry is not None:
         odometry_s = compute_seconds(odometry.stamp_ns, zero_ns)

@@ -115,7 +115,7 @@ def _can_tell_changes(m: Measurements) -> bool:
     carries = (
         bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
     )
-    return carries and float(np.median(m.gnss.variance_m2[:, 0])) < 0.5**2
+    return carries and float(np.median(m.gnss.variance_m2[:, 0])) < 0.5**2  # m²; motion carries the pose better
 
 
 def prepare_section(m: Measurements, output_ns: Ints, gate_probability: float) -> SectionModel:
@@ -247,7 +247,7 @@ class SectionModel:
             others, best = best[0].changes, tried[top]
             for size in kinds.pop(top)[1:]:
                 larger = self._judge((*others, Change(*top, 0, size=size)), start)
-                if larger[0].score <= best[0].score + 8.0:
+                if larger[0].score <= best[0].score + 8.0:  # nat; gain by a larger error
                     break
                 best = larger
         return best

@@ -131,7 +131,7 @@ def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_s
         return fit.yaw_rad, min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
     if gnss.quat_xyzw is not None and posed.size:  # the first attitude of a pose, less what the robot turned until then
         turned = path.reckoned.yaw(compute_seconds(gnss.stamp_ns[posed], start_ns))
-        return float(rpy_from_quat(gnss.quat_xyzw[posed[0]])[2] - turned[0]), 0.1, "pose"
+        return float(rpy_from_quat(gnss.quat_xyzw[posed[0]])[2] - turned[0]), 0.1, "pose"  # rad: its frame and mounting
     return own, _UNKNOWN_YAW_STD_RAD, source or "unknown"
 
 
@@ -153,8 +153,8 @@ def _fit_course(gnss: Positions, path: _Path) -> _Fit | None:
     wanted = max(5.0, 10.0 * noise)  # [m]: yaw to 6°
     drawn = path.antenna(stamp_s)
     found: list[_Fit] = []
-    for first in np.unique(np.searchsorted(stamp_s, np.arange(stamp_s[0], stamp_s[-1], 2.0))):
-        near = slice(first, int(np.searchsorted(stamp_s, stamp_s[first] + 120.0, "right")))
+    for first in np.unique(np.searchsorted(stamp_s, np.arange(stamp_s[0], stamp_s[-1], 2.0))):  # step [s]
+        near = slice(first, int(np.searchsorted(stamp_s, stamp_s[first] + 120.0, "right")))  # longest [s]
         far = np.flatnonzero(np.abs(fixes[near] - fixes[first]) >= wanted)
         if far.size == 0:
             continue
@@ -212,7 +212,7 @@ def find_stationary_intervals(measurements: Measurements) -> Ints:
     # Clipped, so that a single wild sample does not wake the robot.
     clipped = np.clip(wheels.velocity_mps[:, :1], -0.2, 0.2)
     still = _is_steady(stamp, stamp, clipped, 0.02, 0.06)  # m/s: encoders at rest
-    quiet_radps = max(0.012, 4 * imu.gyro_std_radps)
+    quiet_radps = max(0.012, 4 * imu.gyro_std_radps)  # noise at rest [rad/s]; judged
     still &= _is_steady(stamp, imu.stamp_ns, imu.angular_velocity_radps, 0.05, quiet_radps)  # a bias is less
     return _find_intervals(stamp, still)
 

@@ -71,6 +71,7 @@ def get_turn_rates(measurements: Measurements, role: str) -> tuple[Ints, Floats]
 def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Attitude | None:
     """Return the attitude from ``zero_ns`` on; None where no sensor shows turns."""
     imu = measurements.imu
+    # Slower IMUs show no turns [ns].
     shows = imu is not None and imu.stamp_ns.size >= _FEWEST and compute_median_period_ns(imu.stamp_ns) <= 100_000_000
     role = IMU if shows else next(reversed(measurements.turning_odometries()), "")
     if not role or end_s < 2 * STEP_S:
@@ -129,7 +130,7 @@ def _multiply_increments(turn_rad: Floats) -> Floats:
 
 def _find_up(quat: Floats, force: Floats) -> Floats:
     """Return the direction of the averaged specific force in the drifting frame, (n, 3)."""
-    up = average_grid(np.einsum("nij,nj->ni", matrix_from_quat(quat), force), 10.0)
+    up = average_grid(np.einsum("nij,nj->ni", matrix_from_quat(quat), force), 10.0)  # averaging time [s]
     return np.asarray(up / np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9))
 
 
@@ -219,7 +220,7 @@ class _Alignment:
         self._attitude = attitude
         self._arm_m = attitude.rotation @ np.asarray(gnss.lever_arm_m)
         time_s, end_s = compute_seconds(gnss.stamp_ns, zero_ns), float(attitude.time_s[-1])
-        window_s = min(10.0, 0.25 * end_s)
+        window_s = min(10.0, 0.25 * end_s)  # of the alignment [s]
         apart = max(1, round(0.2 * window_s * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
         first = np.arange(0, time_s.size, apart)
         last = np.minimum(np.searchsorted(time_s, time_s[first] + window_s), time_s.size - 1)
@@ -257,7 +258,7 @@ class _Alignment:
             velocity, arm = self._horizontal(forward, fit)
             moved = self._difference(integrate_grid(velocity) + arm)
             length = np.abs(moved)
-            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, 0.2)
+            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, 0.2)  # shows a heading [m]
             if moving.sum() < _FEWEST:
                 return None
             unit = np.conj(moved) / np.maximum(length, 1e-9)
@@ -318,6 +319,6 @@ class _Alignment:
             off = rise - multiply_by_vector(matrix, pitch)
             noise = float(np.median(np.abs(off))) + 1e-9
             root = 1.0 / (1.0 + np.square(off / (2.5 * noise)))
-            rows = np.concatenate((matrix * root[:, None], np.eye(knots_s.size) * (noise / 0.1)))
+            rows = np.concatenate((matrix * root[:, None], np.eye(knots_s.size) * (noise / 0.1)))  # σ of pitch 0.1 rad
             pitch = solve_least_squares(rows, np.concatenate((rise * root, np.zeros(knots_s.size))))
         return np.interp(self._attitude.time_s, knots_s, pitch)

@@ -128,7 +128,7 @@ class BodyVelocities:
     @property
     def measured(self) -> NDArray[np.bool_]:
         """Axes along which most rows have a velocity, shape (3,)."""
-        is_measured: NDArray[np.bool_] = (self.variance_m2ps2 < 1e3).mean(0) > 0.5
+        is_measured: NDArray[np.bool_] = (self.variance_m2ps2 < 1e3).mean(0) > 0.5  # above: not measured (ruling)
         return is_measured
 
 

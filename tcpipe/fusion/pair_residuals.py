@@ -40,7 +40,7 @@ FIX_S, SCALE_S = (1.0, 3.0, 10.0, 30.0, 100.0), (3.0, 10.0, 30.0, 100.0)
 MOVING_S = (1.0, 3.0)
 """The same of errors of fixes that are there only while the robot moves."""
 
-_STILL_MPS = 0.02
+_STILL_MPS = 0.02  # slower: stationary
 _PAIR_STEP_S = 0.1  # between windows' ends of sensors that are no fixes
 
 
@@ -83,8 +83,8 @@ class _Section:
         """
         at_s = compute_seconds(at_ns, self.zero_ns)
         period_s = max(float(np.median(np.diff(at_s))), 1e-3) if at_s.size > 1 else np.inf
-        gaps_ns = [find_longest_step_ns(stamp_ns, 300_000_000) for stamp_ns in sources]
-        for time_s in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0):
+        gaps_ns = [find_longest_step_ns(stamp_ns, 300_000_000) for stamp_ns in sources]  # longest gap [ns]
+        for time_s in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0):  # time differences [s]
             if time_s < 0.9 * period_s:
                 continue
             # Eight begin in the length of one, and there are 600 of one length at most.
@@ -114,7 +114,7 @@ def find_residuals(measurements: Measurements) -> list[Residuals]:
     residuals = list[Residuals]()
     forward = {role: compute_forward_mps(each, attitude, zero_ns) for role, each in odometries.items()}
     tracks = {} if gnss is None else align_tracks(forward, gnss, attitude, zero_ns)
-    speed = np.abs(average_grid(np.column_stack([*forward.values()]), 0.5)).max(axis=1)
+    speed = np.abs(average_grid(np.column_stack([*forward.values()]), 0.5)).max(axis=1)  # averages noise [s]
     for role, track in tracks.items():
         residuals += _compare_fixes(section, gnss, role, track, speed) if gnss is not None else []
     if len(tracks) < len(forward):
@@ -234,7 +234,7 @@ class _Window:
         """Return whether the robot neither moves nor turns in each window."""
         turned = np.ptp(_take_nodes(self._yaw, *self._span), axis=1)
         return np.asarray(
-            (_take_nodes(speed_mps, *self._span) < _STILL_MPS).all(1) & (turned < 0.02 + 0.01 * self.time_s)
+            (_take_nodes(speed_mps, *self._span) < _STILL_MPS).all(1) & (turned < 0.02 + 0.01 * self.time_s)  # rad
         )
 
     def describe(self, role: str, axis: str, *, has_others: bool) -> dict[str, Floats]:

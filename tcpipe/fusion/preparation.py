@@ -152,7 +152,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
         return gnss, ()
     last = np.append(first[1:], stamp_ns.size) - 1
     kept_ns = stamp_ns[last] - stamp_ns[first]
-    lasting = kept_ns >= max(1_000_000_000, 2 * compute_median_period_ns(stamp_ns[first]))
+    lasting = kept_ns >= max(1_000_000_000, 2 * compute_median_period_ns(stamp_ns[first]))  # less: a slow receiver
     if odometry is None:
         kept = changes | np.repeat(lasting, last - first + 1)
         return (gnss if kept.all() else select_sensor_rows(gnss, kept)), ()
@@ -190,7 +190,7 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
     # One outlying fix spoils two pairs: the fourth fifth bears one in ten, yet sees tails that the median does not.
     spread_s = np.quantile(_make_windows(np.abs(residual_s)), 0.8, axis=1) / 1.2816
     excess_s2 = spread_s**2 / 2 - claimed_s2
-    matters = excess_s2 > np.maximum(0.05**2, 4 * claimed_s2)
+    matters = excess_s2 > np.maximum(0.05**2, 4 * claimed_s2)  # less than 0.05 s does not matter
     middle_s = (0.5 * (stamp_s[1:] + stamp_s[:-1]))[moving]
     jitter_s = np.interp(stamp_s, middle_s, np.sqrt(np.where(matters, excess_s2, 0.0)))
     variance = gnss.variance_m2.copy()
@@ -205,11 +205,11 @@ def inflate_late_fixes(gnss: Positions, late_s: float) -> Positions:
     A first-order low-pass of time τ delays positions by τ; once that is corrected, they are off by τ² times the
     acceleration. Correlation with speeds shows a delay below τ, so that the rest may be as long as the delay.
     """
-    if late_s < 0.2:
+    if late_s < 0.2:  # such a receiver does not filter its positions [s]
         return gnss
     axes = list(gnss.position_enu_m[:, :2].T)
     for _ in range(2):
-        axes = [compute_slopes(gnss.stamp_ns, axis, max(2.0 * late_s, 1.0)) for axis in axes]
+        axes = [compute_slopes(gnss.stamp_ns, axis, max(2.0 * late_s, 1.0)) for axis in axes]  # shortest [s]
     variance = gnss.variance_m2.copy()
     variance[:, :2] += ((late_s**2 * np.hypot(*axes)) ** 2)[:, None]
     return replace(gnss, variance_m2=variance, unclaimed=np.ones(len(variance), np.bool_), lag_std_s=late_s)
@@ -296,7 +296,7 @@ def _rotate_vectors(matrix: Floats, values: Floats) -> Floats:
     """Return ``matrix`` (3, 3) times vectors (N, 3); an axis is NaN if an unmeasured component contributes to it."""
     unknown = np.isnan(values)
     turned = np.where(unknown, 0.0, values) @ matrix.T
-    return np.where(unknown @ (np.abs(matrix).T > 0.1), np.nan, turned)
+    return np.where(unknown @ (np.abs(matrix).T > 0.1), np.nan, turned)  # cosine, 6°
 
 
 def prepare_imu(
@@ -449,7 +449,7 @@ def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Flo
         return rate_radps, np.zeros(3, np.bool_)
     stamp, quat = stamp_ns[known], quat_xyzw[known]
     turned_rad = np.cumsum(compute_turns(quat), axis=0)
-    turns = zero & (np.ptp(turned_rad, axis=0) > 0.2)
+    turns = zero & (np.ptp(turned_rad, axis=0) > 0.2)  # a larger turn contradicts zero [rad]
     # Over two steps, so that the rate is that in the middle, at the stamp itself.
     step_s = (stamp[2:] - stamp[:-2])[:, None] * 1e-9
     rate = compute_turns(quat, 2) / step_s

@@ -162,7 +162,7 @@ def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:
     found = np.full(at_ns.size, np.nan)
     for source in sources:
         covered = is_covered(source.stamp_ns, at_ns, at_ns)
-        slope = compute_slopes(source.stamp_ns, source.velocity_mps[:, 0], 0.6)
+        slope = compute_slopes(source.stamp_ns, source.velocity_mps[:, 0], 0.6)  # window [s]
         found[covered] = np.fmin(found[covered], np.interp(at_ns[covered], source.stamp_ns, np.abs(slope)))
     unseen = np.full(at_ns.size, _UNKNOWN_DENSITY) if sources else _compute_receiver_density(m, at_ns)
     return np.where(np.isnan(found), unseen, _MIN_DENSITY + _ACCELERATION_LASTS_S * found**2)
@@ -181,7 +181,7 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     if isinstance(source, Positions):
         std, order = float(np.sqrt(np.median(source.variance_m2[:, :2]))), 2
         velocity_std_mps = np.sqrt(12.0 / 5.0) * std / max(1.0, 5.0 * period_s)  # five fixes, for a second at least
-        least = _UNKNOWN_DENSITY * min(1.0, (velocity_std_mps / 0.5) ** 2)
+        least = _UNKNOWN_DENSITY * min(1.0, (velocity_std_mps / 0.5) ** 2)  # worse ones do not show its change
         places = remove_wild_places(source.position_enu_m)
         axes = [places.real, places.imag]
     else:
@@ -202,5 +202,5 @@ def _estimate_slide_density(visual: BodyVelocities | None) -> float:
     """Return the density of sideways and upward velocity [m²/s³]: as visual odometry shows it, or a guess."""
     if visual is None or visual.stamp_ns.size < 3:
         return 4e-4
-    shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], 1.0) for axis in (1, 2)]
+    shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], 1.0) for axis in (1, 2)]  # window [s]
     return max(_MIN_DENSITY, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)

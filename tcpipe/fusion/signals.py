@@ -93,7 +93,7 @@ def hold_last(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
         return np.full(at_ns.size, np.nan)
     index = np.searchsorted(stamp_ns, at_ns, "right") - 1
     last = np.maximum(index, 0)
-    is_known = (index >= 0) & (at_ns - stamp_ns[last] <= find_longest_step_ns(stamp_ns, 1_000_000_000))
+    is_known = (index >= 0) & (at_ns - stamp_ns[last] <= find_longest_step_ns(stamp_ns, 1_000_000_000))  # held at least
     return np.where(is_known, values[last], np.nan)
 
 

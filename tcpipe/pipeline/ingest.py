@@ -127,10 +127,10 @@ class CallOptions:
 
 
 def run_ingest(options: IngestOptions) -> IngestSummary:
-    """Ingest logs (files, ROS 2 bag directories, folders of them) into the store; what is there already is left alone.
+    """Ingest logs (files, ROS 2 bag directories, folders of them) that the store does not have yet.
 
-    Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` when nothing can be begun; what goes wrong with one
-    log or path stands in its result.
+    Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` if no log can be begun. The result of a log or path
+    has its own errors.
     """
     refuse_import_of_script(options.jobs)
     opened = open_store(options.store, create=True)

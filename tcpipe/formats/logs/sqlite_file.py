@@ -233,7 +233,7 @@ class SqlitePart:
                 yield row
 
     def _first_behind(self, query: str, low: int) -> Any:
-        """Return the row of the first readable id above ``low``, found in steps that double; None if there is none."""
+        """Return the row of the first readable id above ``low``, found in steps that double; None without such a row."""
         step = 1
         while low + step <= _LAST_ID and self._first_from(query, low + step) is None:
             step *= 2

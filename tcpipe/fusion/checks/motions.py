@@ -66,7 +66,7 @@ def iterate_windows_ns(m: Measurements, length_ns: int) -> Iterator[Ints]:
 
 def find_liveliest_window_ns(m: Measurements) -> Ints | None:
     """Return the grid [ns] of the half hour in which the robot drives most; None without measurements."""
-    windows = iterate_windows_ns(m, 1800 * 10**9)
+    windows = iterate_windows_ns(m, 1800 * 10**9)  # grids of half an hour stay small
     return max(windows, key=lambda at_ns: float(np.diff(compute_driven_m(m, at_ns[[0, -1]]))[0]), default=None)
 
 
@@ -312,5 +312,6 @@ def find_coarse_lag(late: Floats, against: Floats) -> float | None:
     # Noise reaches 4 σ in 3,000 lags. Repeated lanes have several peaks that are about as high.
     is_noise = float(correlation[best]) * np.sqrt(late.shape[1] / _INDEPENDENT) < 6.0
     apart = np.abs(np.arange(correlation.size) - best) * _COARSE_S > 3.0
+    # A rival explains as much on drives that repeat themselves; judged on simulated drives.
     has_rival = abs(lag_s) > NEAR_S and float(correlation[apart].max()) > 0.7 * float(correlation[best])
     return None if is_noise or np.isnan(lag_s) or has_rival else lag_s

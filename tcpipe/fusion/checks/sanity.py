@@ -173,7 +173,7 @@ def _list_constants(m: Measurements) -> Iterator[tuple[str, str, int]]:
             (IMU, "angular_velocity", m.imu.angular_velocity_radps),
         ]
     for role, quantity, each in values:
-        if len(each) >= 20 and np.array_equal(each, np.broadcast_to(each[0], each.shape), equal_nan=True):
+        if len(each) >= 20 and np.array_equal(each, np.broadcast_to(each[0], each.shape), equal_nan=True):  # ruling
             yield role, quantity, len(each)
 
 
@@ -183,6 +183,7 @@ def _list_constants(m: Measurements) -> Iterator[tuple[str, str, int]]:
 def _find_yaws(force: Plane, twists: Mapping[str, Floats]) -> dict[str, float]:
     """Return by odometry the yaw of the levelled IMU [rad] where accelerations show it."""
     lags = {role: find_lag(compute_acceleration(twist), force) for role, twist in twists.items()}
+    # Slopes act on accelerometers, so little is explained; judged.
     return {role: float(np.angle(lag.factor)) for role, lag in lags.items() if lag and lag.explained > 0.1}
 
 
