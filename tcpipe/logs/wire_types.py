@@ -202,56 +202,33 @@ def _parse_field_type(found: re.Match[str], owner: str) -> FieldType:
     return FieldType(name, limit, int(found["size"] or 0), fixed)
 
 
-_MAX_STEPS = 20_000
-"""A walk of more steps is given up: a few endless lists among short ones are cheaper to read one by one."""
-_CDR_BYTE_ORDER = {0: ">", 1: "<", 6: ">", 7: "<"}
-_PLAIN_XCDR2 = (6, 7)
-_XCDR2_ALIGNMENT = 4
-_CDR_HEADER = 4
-_CDR_PADDING = 3
+_MAX_ELEMENTS = 20_000
+"""Most texts or irregular messages of a list: they are found one after the other [1]."""
 
 
 class LayoutError(ValueError):
     """Messages do not fit their definition: a length runs past their end, or bytes are left over."""
 
 
-class RaggedError(ValueError):
-    """Messages are too irregular to be read by columns."""
-
-
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How messages are serialised.
+    """How messages are serialised, in little-endian byte order.
 
     Fields begin ``origin`` bytes into a message, are aligned from there to at most ``max_alignment``; texts end in
     ``terminator`` bytes that are no text; a message without fields takes ``empty_record_bytes``; up to ``padding``
     bytes may follow the last field.
     """
 
-    byte_order: str
     origin: int
     max_alignment: int
     terminator: int
     empty_record_bytes: int
     padding: int
 
-    @property
-    def known_to_rosbags(self) -> bool:
-        """Whether rosbags reads it, too (all but XCDR2)."""
-        return self.max_alignment != _XCDR2_ALIGNMENT
 
-
-ROS1 = Dialect("<", 0, 1, 0, 0, 0)
-
-
-def find_dialect(payload: bytes, encoding: str) -> Dialect:
-    """Return the dialect of a message, in CDR by its first bytes; `LayoutError` for any but CDR's plain ones."""
-    if encoding == "ros1":
-        return ROS1
-    if len(payload) < _CDR_HEADER or payload[0] != 0 or payload[1] not in _CDR_BYTE_ORDER:
-        raise LayoutError(f"CDR header {payload[:_CDR_HEADER].hex(' ')} is invalid in ROS 2")
-    max_alignment = _XCDR2_ALIGNMENT if payload[1] in _PLAIN_XCDR2 else 8
-    return Dialect(_CDR_BYTE_ORDER[payload[1]], _CDR_HEADER, max_alignment, 1, 1, _CDR_PADDING)
+ROS1 = Dialect(0, 1, 0, 0, 0)
+CDR = Dialect(4, 8, 1, 1, 3)
+"""Plain CDR, version 1: what the middlewares of ROS 2 write."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,7 +304,7 @@ class WalkResult:
 
 
 def walk(message: Record, data: Bytes, starts: Ints, ends: Ints, dialect: Dialect) -> WalkResult:
-    """Find every field of every message; `RaggedError` if they differ so much that one by one is cheaper.
+    """Find every field of every message.
 
     Each begins and ends in ``data`` at ``starts`` and ``ends``, shape (N,), rising.
     """
@@ -363,7 +340,7 @@ class _Cursors:
 
     def __init__(self, data: Bytes, bases: Places, sizes: Ints, dialect: Dialect) -> None:
         self._data, self._bases, self._sizes, self._dialect = data, bases, sizes, dialect
-        self._at, self._steps = 0, 0
+        self._at = 0
         self._positions, self._good = np.zeros(len(sizes), np.int64), sizes >= 0
         self._counts: NDArray[np.void] = np.ndarray(
             (max(len(data) - 3, 0),), "V4", data if len(data) > 3 else b"", 0, (1,)
@@ -376,12 +353,9 @@ class _Cursors:
 
     def values(self, wire_type: WireType, rows: Ints) -> Values:
         """Step over one value in each of the ``rows``: all messages, none, or some of those without a grid."""
-        self._steps += 1
-        if self._steps > _MAX_STEPS:
-            raise RaggedError(f"more than {_MAX_STEPS} steps")
         match wire_type:
             case Scalar():
-                dtype = np.dtype(self._dialect.byte_order + wire_type.code)
+                dtype = np.dtype("<" + wire_type.code)
                 return Scalars(self.take(rows, dtype.itemsize, dtype.itemsize), dtype)
             case Text():
                 lengths = self.count(rows)
@@ -399,15 +373,17 @@ class _Cursors:
 
     def array(self, array: Array, rows: Ints) -> Values:
         counts = self.count(rows) if array.length is None else array.length
+        is_regular = _find_regular_size(array.element, self._dialect.max_alignment)[0] > 0
+        most = np.inf if is_regular or array.length is not None else _MAX_ELEMENTS
         if isinstance(self._bases, Grid) and len(rows):
-            if counts > self._sizes[0] - self._at:  # an element takes a byte at least
+            if counts > min(self._sizes[0] - self._at, most):  # an element takes a byte at least
                 raise LayoutError(f"{counts} elements")
         else:
-            endless = counts > self._sizes[rows] - self._positions[rows]
+            endless = counts > np.minimum(self._sizes[rows] - self._positions[rows], most)
             self._good[rows[endless]] = False
             counts = np.where(endless, 0, counts)
         if isinstance(array.element, Scalar):
-            dtype = np.dtype(self._dialect.byte_order + array.element.code)
+            dtype = np.dtype("<" + array.element.code)
             sizes = counts * dtype.itemsize
             places = self.take(rows, sizes, np.where(counts > 0, dtype.itemsize, 1))
             return Runs(places, np.broadcast_to(sizes, len(rows)), dtype)
@@ -449,7 +425,7 @@ class _Cursors:
 
     def count(self, rows: Ints) -> int | Ints:
         """Step over a length in each row; return them, as one number where all messages have the same."""
-        places, dtype = self.take(rows, 4, 4), np.dtype(self._dialect.byte_order + "u4")
+        places, dtype = self.take(rows, 4, 4), np.dtype("<u4")
         if isinstance(places, Grid):
             counts = places.view(self._data, dtype).astype(np.int64)
             if (counts == counts[0]).all():

@@ -6,23 +6,22 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rosbags.typesys import get_types_from_msg
 
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.log_part import MessageBlock
 from tcpipe.formats.logs.ros_types import MessageType
-from tcpipe.logs.wire_types import Array, LayoutError, Record, Scalar, Text, find_dialect, make_record
+from tcpipe.logs.wire_types import Array, Record, Scalar, Text, make_record
 
 CODES = ("?", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
-HEADERS = {b"\x00\x00": (">", 8), b"\x00\x01": ("<", 8), b"\x00\x06": (">", 4), b"\x00\x07": ("<", 4), None: ("<", 1)}
-"""CDR big- and little-endian, plain XCDR2 big- and little-endian, ROS 1: byte order and largest alignment."""
+HEADERS = {b"\x00\x01": 8, None: 1}
+"""CDR and ROS 1: largest alignment."""
 
 
 class Writer:
     """Serialises one message as the specifications say, one value after the other."""
 
     def __init__(self, header):
-        self.order, self.max_alignment = HEADERS[header]
+        self.max_alignment = HEADERS[header]
         self.header, self.body = header, bytearray()
 
     def message(self, of, value):
@@ -33,7 +32,7 @@ class Writer:
         self.body += bytes(-len(self.body) % min(size, self.max_alignment))
 
     def number(self, code, value):
-        packed = np.array(value, np.dtype(self.order + code)).tobytes()
+        packed = np.array(value, np.dtype("<" + code)).tobytes()
         self.align(len(packed))
         self.body += packed
 
@@ -101,13 +100,13 @@ def flat(of, value, prefix=""):
             yield prefix + name, value[name]
 
 
-def decoded(of, payloads, encoding, definitions=None):
-    """Return a table of messages, and how many could not be decoded."""
-    table = TopicTable(MessageType(of, "log", definitions or {}), encoding)
+def decoded(of, payloads, encoding):
+    """Return a table of messages, and how many could not be decoded and why."""
+    table = TopicTable(MessageType(of, "log", {}), encoding)
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
     rows = np.arange(len(payloads))
     table.add(MessageBlock(0, memoryview(b"".join(payloads)), np.cumsum(lengths) - lengths, lengths, rows, rows, rows))
-    return table.take(), table.undecodable
+    return table.take(), table.undecodable, table.undecodable_reason
 
 
 @settings(max_examples=60, deadline=None)
@@ -123,7 +122,7 @@ def test_every_type_in_every_serialisation(header, alike, count, seed, data):
     rng = np.random.default_rng(seed)
     values = [random_value(of, rng, np.random.default_rng(seed) if alike else rng) for _ in range(count)]
     payloads = [Writer(header).message(of, value) for value in values]
-    found, lost = decoded(of, payloads, "cdr" if header else "ros1")
+    found, lost, _ = decoded(of, payloads, "cdr" if header else "ros1")
     assert lost == 0
     columns = [name for name, _ in flat(of, values[0])]
     assert found.column_names[2:] == columns
@@ -132,22 +131,21 @@ def test_every_type_in_every_serialisation(header, alike, count, seed, data):
         assert json.dumps(found[name].to_pylist()) == json.dumps(expected), name
 
 
-def _definitions():
-    return get_types_from_msg("string[] texts\nfloat64 number\n", "a/msg/A")
-
-
 @pytest.mark.parametrize("header", [b"\x00\x01", None])
-def test_a_list_too_long_to_be_walked_side_by_side_is_read_message_by_message(header):
+def test_a_message_with_an_endless_list_of_texts_is_left_out(header):
     of = make_record("a/msg/A", (("texts", Array(Text(), None)), ("number", Scalar("f8"))))
     values = [{"texts": ["a"] * count, "number": float(count)} for count in (21_000, 2, 0)]
     payloads = [Writer(header).message(of, value) for value in values]
-    found, lost = decoded(of, payloads, "cdr" if header else "ros1", _definitions())
-    assert lost == 0
-    assert found["texts"].to_pylist() == [value["texts"] for value in values]
-    assert found["number"].to_pylist() == [value["number"] for value in values]
+    found, lost, reason = decoded(of, payloads, "cdr" if header else "ros1")
+    assert lost == 1
+    assert "a list of texts or messages is too long" in reason
+    assert found["texts"].to_pylist() == [value["texts"] for value in values[1:]]
+    assert found["number"].to_pylist() == [value["number"] for value in values[1:]]
 
 
-@pytest.mark.parametrize("payload", [b"", b"\x00\x03\x00\x00" + bytes(12)], ids=["empty", "not a plain encoding"])
-def test_an_encoding_that_is_none_of_ros_is_refused(payload):
-    with pytest.raises(LayoutError):
-        find_dialect(payload, "cdr")
+@pytest.mark.parametrize("payload", [b"", b"\x00\x00\x00\x00" + bytes(12), b"\x00\x07\x00\x00" + bytes(12)])
+def test_an_encoding_that_no_middleware_of_ros_writes_is_refused(payload):
+    of = make_record("a/msg/A", (("number", Scalar("f8")),))
+    found, lost, reason = decoded(of, [payload, Writer(b"\x00\x01").message(of, {"number": 2.0})], "cdr")
+    assert (found["number"].to_pylist(), lost) == ([2.0], 1)
+    assert reason.startswith("CDR header")

@@ -1,38 +1,34 @@
 """Serialised messages of one topic to Arrow columns.
 
 `tcpipe.logs.wire_types` walks some thousand payloads at once. Those of equal length are gathered apart: most have one
-shape, and a field of all of them is a strided view. Only what a walk cannot do goes message by message.
+shape, and a field of all of them is a strided view.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, Ints
+from tcpipe.arrays import Bytes, Ints, Mask
 from tcpipe.formats.logs.log_part import MessageBlock, gather_integers, group_by_key
-from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError
+from tcpipe.formats.logs.ros_types import MessageType
 from tcpipe.logs.wire_types import (
+    CDR,
+    ROS1,
     Array,
-    Dialect,
     Fields,
     Grid,
-    LayoutError,
     Lists,
-    RaggedError,
     Record,
     Runs,
     Scalar,
     Scalars,
     Text,
     Values,
-    WalkResult,
     WireType,
-    find_dialect,
     iterate_flat_fields,
     walk,
 )
@@ -42,12 +38,12 @@ FLUSH_BYTES = 1 << 21
 """Size of the payloads that are converted to columns together [byte]; they fit into the processor's cache."""
 MIN_GROUP = 512
 """Fewer messages of equal length, among others, are not worth a walk of their own."""
-MAX_REFUSED = 20_000
-"""Most messages of a topic that are rejected one by one because they do not fit their definition."""
 MAX_CONTIGUOUS_BYTES = 1 << 30
 """A larger table stays in pieces: Arrow's lists and strings count their values in 31 bits."""
 
 _TIMES_BYTES, _HEAD_BYTES = 24, 4
+_CDR_HEAD = 0x0100
+"""First two bytes of a message in plain CDR, as an integer: little-endian, version 1."""
 _BEFORE_ALL = -(2**63)
 
 LOG_TIME = "log_time_ns"
@@ -85,8 +81,7 @@ class TopicTable:
         """Messages that came after a table for later times was taken."""
         self.held_bytes = 0
         """About how much memory the messages take that no table was taken of yet."""
-        self._type, self._encoding = message_type, encoding
-        self._wire = message_type.wire
+        self._wire, self._dialect = message_type.wire, ROS1 if encoding == "ros1" else CDR
         self._gathered: list[tuple[_Int64, Bytes, _Int64]] = []
         """Rows of messages, their payloads one after the other, and how long each is."""
         self._gathered_bytes = 0
@@ -95,9 +90,6 @@ class TopicTable:
         self._parts: list[tuple[_Int64, pa.Table]] = []
         self._rows = 0
         self._taken_until = _BEFORE_ALL
-        self._side_by_side = True
-        self._refused = 0
-        self._decode_row: Callable[[bytes], dict[str, Any]] | None = None
 
     def add(self, block: MessageBlock) -> None:
         """Add the messages of a block; its buffer is not needed afterwards."""
@@ -166,7 +158,7 @@ class TopicTable:
         self._times, self._parts = [], []
 
     def _flush(self) -> None:
-        """Turn the messages gathered into parts of the table for each dialect."""
+        """Turn the messages gathered into parts of the table."""
         if not self._gathered:
             return
         rows, lengths = (np.concatenate([piece[at] for piece in self._gathered]) for at in (0, 2))
@@ -178,20 +170,27 @@ class TopicTable:
         self._gathered, self._gathered_bytes = [], 0
         ends = np.cumsum(lengths)
         starts = ends - lengths
-        for part in self._split_dialects(data, starts, lengths):
-            first = data[starts[part][0] : ends[part][0]][:4].tobytes()
-            try:
-                dialect = find_dialect(first, self._encoding)
-            except LayoutError as error:
-                self._leave_out(str(error), len(rows[part]))
-            else:
-                self._decode_lengths(rows[part], data, starts[part], ends[part], dialect)
+        fits = self._has_head(data, starts, lengths)
+        if fits.all():
+            self._decode_lengths(rows, data, starts, ends)
+        else:
+            head = data[starts[~fits][0] : ends[~fits][0]][:_HEAD_BYTES].tobytes().hex(" ")
+            self._leave_out(f"CDR header {head} is none that ROS 2 writes (00 01)", int((~fits).sum()))
+            if fits.any():
+                self._decode_lengths(rows[fits], data, starts[fits], ends[fits])
 
-    def _decode_lengths(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64, dialect: Dialect) -> None:
+    def _has_head(self, data: Bytes, starts: _Int64, lengths: _Int64) -> Mask:
+        """Return which messages begin like those of the encoding."""
+        fits = lengths >= self._dialect.origin
+        if self._dialect is CDR and fits.any():
+            fits[fits] = gather_integers(data.data, starts[fits], "u2") == _CDR_HEAD
+        return fits
+
+    def _decode_lengths(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64) -> None:
         """Decode messages; many of equal length are decoded together, since each of their fields is a strided view."""
         lengths = ends - starts
         if (lengths == lengths[0]).all():
-            self._decode_dialect(rows, data, starts, ends, dialect)
+            self._decode(rows, data, starts, ends)
             return
         groups = dict(group_by_key(lengths))
         for length in [
@@ -200,79 +199,25 @@ class TopicTable:
             group = groups.pop(length)
             begins = length * np.arange(len(group))
             alike = _gather_payloads(data.data, starts[group], length)
-            self._decode_dialect(rows[group], alike, begins, begins + length, dialect)
+            self._decode(rows[group], alike, begins, begins + length)
         if groups:
             group = np.sort(np.concatenate(list(groups.values())))
-            self._decode_dialect(rows[group], data, starts[group], ends[group], dialect)
+            self._decode(rows[group], data, starts[group], ends[group])
 
-    def _split_dialects(self, data: Bytes, starts: _Int64, lengths: _Int64) -> Iterator[slice | _Int64]:
-        """Yield which messages have the same head of CDR; those that are too short for one have none."""
-        if self._encoding != "cdr":
-            yield slice(None)
-            return
-        kinds = np.full(len(lengths), -1)
-        has_head = lengths >= _HEAD_BYTES
-        if has_head.any():
-            kinds[has_head] = gather_integers(data.data, starts[has_head], "u2")
-        if (kinds == kinds[0]).all():
-            yield slice(None)
-        else:
-            yield from (rows for _, rows in group_by_key(kinds))
-
-    def _decode_dialect(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64, dialect: Dialect) -> None:
-        """Decode messages side by side, and what that cannot do one by one."""
-        walked = self._walked(data, starts, ends, dialect)
+    def _decode(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64) -> None:
+        """Decode messages side by side; those that do not fit their definition are counted and left out."""
+        walked = walk(self._wire, data, starts, ends, self._dialect)
         if walked.root:
             walked_columns = WalkedColumns(data)
-            self._add_part(rows[walked.fits], list(walked_columns.columns(walked.root, self._wire)))
+            columns = list(walked_columns.columns(walked.root, self._wire))
+            self._parts.append((rows[walked.fits], pa.Table.from_arrays(columns, schema=self._fields)))
             self.replaced_texts += walked_columns.replaced_texts
-        left = ~walked.fits
-        if left.any() and dialect.known_to_rosbags:
-            self._row_by_row(rows[left], data, starts[left], ends[left])
-        elif left.any():
-            self._leave_out("its lengths contradict its size", int(left.sum()))
-
-    def _walked(self, data: Bytes, starts: _Int64, ends: _Int64, dialect: Dialect) -> WalkResult:
-        if self._side_by_side:
-            try:
-                return walk(self._wire, data, starts, ends, dialect)
-            except RaggedError:
-                self._side_by_side = False
-        return WalkResult(None, np.zeros(len(starts), np.bool_))
-
-    def _row_by_row(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64) -> None:
-        """Decode message by message; one that does not fit its definition is counted and left out."""
-        try:
-            decode = self._decode_row = self._decode_row or self._type.row_decoder(self._encoding)
-        except DefinitionError as error:
-            self._leave_out(str(error), len(rows))
-            return
-        kept, values = [], []
-        for number, (row, start, end) in enumerate(zip(rows.tolist(), starts.tolist(), ends.tolist(), strict=True)):
-            if self._refused > MAX_REFUSED:
-                self._leave_out("so many of the topic's do not fit that the rest is not tried", len(rows) - number)
-                break
-            try:
-                values.append(decode(data[start:end].tobytes()))
-            except RowError as error:
-                self._leave_out(str(error), 1)
-                self._refused += 1
-            else:
-                kept.append(row)
-        names = [name for name, _ in iterate_flat_fields(self._type.wire)]
-        columns = [
-            pa.array([value[name] for value in values], arrow_type)
-            for name, arrow_type in zip(names, self._fields.types, strict=True)
-        ]
-        self._add_part(np.array(kept, np.int64), columns)
+        if lost := int((~walked.fits).sum()):
+            self._leave_out("its lengths contradict its size, or a list of texts or messages is too long", lost)
 
     def _leave_out(self, reason: str, count: int) -> None:
         self.undecodable += count
         self.undecodable_reason = self.undecodable_reason or reason
-
-    def _add_part(self, rows: _Int64, columns: list[pa.Array]) -> None:
-        if len(rows):
-            self._parts.append((rows, pa.Table.from_arrays(columns, schema=self._fields)))
 
 
 def _gather_payloads(buffer: memoryview, offsets: _Int64, length: int) -> Bytes:

@@ -8,21 +8,16 @@ Types are kept by definition text, never by name alone: two logs, or two topics,
 from __future__ import annotations
 
 import functools
-import re
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from rosbags.interfaces import Nodetype
-from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
-from rosbags.typesys.base import normalize_fieldname
-from rosbags.typesys.store import Typestore
 
 from tcpipe.errors import LogError
 from tcpipe.logs.topics import normalize_type_name
@@ -32,6 +27,7 @@ from tcpipe.logs.wire_types import (
     MAX_FIXED_ELEMENTS,
     Array,
     FieldType,
+    FieldTypes,
     MsgTextError,
     Record,
     Scalar,
@@ -45,7 +41,7 @@ from tcpipe.logs.wire_types import (
 
 Source = Literal["log", "given", "bundled"]
 
-_Definitions = dict[str, tuple[Any, list[tuple[str, Any]]]]
+_Definitions = dict[str, FieldTypes]
 
 _CODES = {
     "bool": "?",
@@ -66,22 +62,18 @@ MAX_DEFINITION_BYTES = 1 << 20
 """Longest definition that is read [byte]; those of ROS's largest messages, with all their parts, have some 20 KB."""
 _MAX_LENGTH = 1 << 31
 _MAX_DEPTH = 64
-_TYPE_NAME, _FIELD_NAME = re.compile(r"[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*"), re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _PLACEHOLDER = "structure_needs_at_least_one_member"
-_IDL_SEPARATOR = "=" * 80 + "\n"
+_SEPARATOR = "=" * 80 + "\n"
+_ROS1_NAMES = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Duration": "duration"}
 
 
 class DefinitionError(ValueError):
     """A type has no usable definition; the text says why, plainly."""
 
 
-class RowError(ValueError):
-    """A message does not fit its definition."""
-
-
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """A type ready for decoding: its fields, and the row-by-row decoder.
+    """A type ready for decoding: its fields, and the definitions of it and its parts.
 
     ``source`` is where its definition comes from: ``log``, ``given`` (by the user's directory) or ``bundled``.
     """
@@ -90,42 +82,28 @@ class MessageType:
     source: Source
     definitions: _Definitions
 
-    def row_decoder(self, encoding: str) -> Callable[[bytes], dict[str, Any]]:
-        """Return a function from one serialised message to its fields by dotted name, by rosbags; it raises `RowError`.
-
-        `DefinitionError`: rosbags makes no type of the definition.
-        """
-        store = _make_typestore(self.definitions)
-        name = self.wire.name
-        deserialize = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
-
-        def decode(payload: bytes) -> dict[str, Any]:
-            try:
-                message = deserialize(payload, name)
-            except (SerdeError, ValueError, IndexError, OverflowError, AssertionError, struct.error) as error:
-                raise RowError(str(error)) from None
-            return dict(_iterate_flat_values(message, self.wire, ""))
-
-        return decode
-
     def text(self, *, ros1: bool) -> str:
         """Return the definition as text, without comments: for where the log holds none."""
-        store = _make_typestore(self.definitions)
-        return store.generate_msgdef(self.wire.name, ros_version=1 if ros1 else 2)[0]
+        texts = dict[str, str]()
+        self._add_text(self.wire.name, texts, _ROS1_NAMES if ros1 else {})
+        parts = (f"{_SEPARATOR}MSG: {_shorten(name)}\n{text}" for name, text in list(texts.items())[1:])
+        return "".join((texts[self.wire.name], *parts))
+
+    def _add_text(self, name: str, texts: dict[str, str], built_in: Mapping[str, str]) -> None:
+        """Add the lines of a message, then those of its parts."""
+        texts[name], lines = "", list[str]()
+        for field, kind in self.definitions[name]:
+            if kind.name not in {*BASE_TYPES, *built_in, *texts}:
+                self._add_text(kind.name, texts, built_in)
+            limit = f"<={kind.text_limit}" if kind.text_limit else ""
+            count = "" if not kind.length else f"{'' if kind.fixed else '<='}{kind.length}"
+            array = "" if kind.length is None else f"[{count}]"
+            lines.append(f"{built_in.get(kind.name) or _shorten(kind.name)}{limit}{array} {field}\n")
+        texts[name] = "".join(lines)
 
 
-def _make_typestore(definitions: _Definitions) -> Typestore:
-    """Return rosbags' store of types; it runs Python code made of their names, so only plain names may reach it."""
-    odd = [name for name in definitions if not _TYPE_NAME.fullmatch(name)]
-    odd += [field for _, fields in definitions.values() for field, _ in fields if not _FIELD_NAME.fullmatch(field)]
-    if odd:
-        raise DefinitionError(f"{odd[0]!r} is no name that ROS allows")
-    store = Typestore()
-    try:
-        store.register({name: ([], fields) for name, (_, fields) in definitions.items()})  # constants take no bytes
-    except TypesysError as error:
-        raise DefinitionError(str(error)) from None
-    return store
+def _shorten(name: str) -> str:
+    return name.replace("/msg/", "/")
 
 
 class TypeLibrary:
@@ -190,20 +168,20 @@ class TypeLibrary:
                 return {}, given
             raise
 
-    def _fallback(self, type_name: str, *, ros1: bool) -> Any | None:
+    def _fallback(self, type_name: str, *, ros1: bool) -> FieldTypes | None:
         for known in (self._own, _load_own_definitions()):
             if type_name in known:
                 return known[type_name]
         for edition in (ros1, not ros1):
-            if type_name in _load_rosbags_definitions(ros1=edition):
-                return _load_rosbags_definitions(ros1=edition)[type_name]
+            if type_name in (known_to_rosbags := _load_rosbags_definitions(ros1=edition)):
+                return _read_rosbags_fields(*known_to_rosbags[type_name])
         return None
 
 
 class _Unfold:
     """Turns parsed definitions into one `Record`, looking up missing types and refusing recursion."""
 
-    def __init__(self, known: _Definitions, fallback: Callable[[str], Any | None], used: _Definitions) -> None:
+    def __init__(self, known: _Definitions, fallback: Callable[[str], FieldTypes | None], used: _Definitions) -> None:
         self._known, self._fallback, self._used = known, fallback, used
         self._records: dict[str, Record] = {}
 
@@ -213,14 +191,11 @@ class _Unfold:
         if len(within) > _MAX_DEPTH:
             raise DefinitionError(f"type {within[0]} nests more than {_MAX_DEPTH} messages in one another")
         if name not in self._records:
-            entry = self._known.get(name) or self._fallback(name)
+            entry = self._known[name] if name in self._known else self._fallback(name)
             if entry is None:
                 raise DefinitionError(f"type {name}, a part of {within[0]}, is defined neither in the log nor bundled")
-            fields = tuple(
-                (field, self.wire_type(described, (*within, name)))
-                for field, described in entry[1]
-                if field != _PLACEHOLDER
-            )
+            entry = tuple((field, kind) for field, kind in entry if field != _PLACEHOLDER)
+            fields = tuple((field, self.wire_type(kind, (*within, name))) for field, kind in entry)
             self._used[name] = entry
             twice = sorted(field for field, count in Counter(field for field, _ in fields).items() if count > 1)
             if twice:
@@ -228,28 +203,25 @@ class _Unfold:
             self._records[name] = make_record(name, fields)
         return self._records[name]
 
-    def wire_type(self, described: Any, within: tuple[str, ...]) -> WireType:
-        kind, argument = described
-        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            inner, length = argument
-            if length > _MAX_LENGTH:
-                raise DefinitionError(f"type {within[-1]}: an array of {length} elements is longer than any message")
-            element = self.wire_type(inner, within)
-            if isinstance(element, Array):
-                raise DefinitionError(f"type {within[-1]}: arrays of arrays are not supported")
-            return Array(element, length if kind == Nodetype.ARRAY else None)
-        if kind == Nodetype.NAME:
-            return self.record(argument, within)
-        if argument[0] == "string":
+    def wire_type(self, kind: FieldType, within: tuple[str, ...]) -> WireType:
+        if kind.length is not None and kind.length > _MAX_LENGTH:
+            raise DefinitionError(f"type {within[-1]}: an array of {kind.length} elements is longer than any message")
+        element = self._element(kind.name, within)
+        return element if kind.length is None else Array(element, kind.length if kind.fixed else None)
+
+    def _element(self, name: str, within: tuple[str, ...]) -> Scalar | Text | Record:
+        if name == "string":
             return Text()
-        if argument[0] not in _CODES:
-            raise DefinitionError(f"type {within[-1]}: fields of type {argument[0]} are not supported")
-        return Scalar(_CODES[argument[0]])
+        if name in _CODES:
+            return Scalar(_CODES[name])
+        if name in BASE_TYPES:
+            raise DefinitionError(f"type {within[-1]}: fields of type {name} are not supported")
+        return self.record(name, within)
 
 
 def _parse_definitions(type_name: str, definition: str, schema_encoding: str) -> _Definitions:
     try:
-        if schema_encoding == "ros2idl" or definition.startswith(_IDL_SEPARATOR + "IDL: "):
+        if schema_encoding == "ros2idl" or definition.startswith(_SEPARATOR + "IDL: "):
             return _parse_idl(definition)
         return _parse_msg(type_name, definition)
     except (TypesysError, RecursionError, ValueError, KeyError, IndexError) as error:
@@ -261,38 +233,38 @@ def _parse_definitions(type_name: str, definition: str, schema_encoding: str) ->
 
 def _parse_msg(type_name: str, definition: str) -> _Definitions:
     try:
-        parsed = parse_msg(definition, type_name)
+        return parse_msg(definition, type_name)
     except MsgTextError:  # rosbags may know better, and says what is wrong
-        return get_types_from_msg(definition.replace("\r\n", "\n"), type_name)
-    return {
-        name: ([], [(field, _describe_field_type(field_type)) for field, field_type in fields])
-        for name, fields in parsed.items()
-    }
-
-
-def _describe_field_type(field_type: FieldType) -> Any:
-    """Return a field's type as rosbags describes it."""
-    one: Any = (
-        (Nodetype.BASE, (field_type.name, field_type.text_limit))
-        if field_type.name in BASE_TYPES
-        else (Nodetype.NAME, field_type.name)
-    )
-    if field_type.length is None:
-        return one
-    return (Nodetype.ARRAY if field_type.fixed else Nodetype.SEQUENCE, (one, field_type.length))
+        found = get_types_from_msg(definition.replace("\r\n", "\n"), type_name)
+        return {name: _read_rosbags_fields(*described) for name, described in found.items()}
 
 
 def _parse_idl(definition: str) -> _Definitions:
-    if not definition.startswith(_IDL_SEPARATOR):
-        return get_types_from_idl(definition)
-    found: _Definitions = {}
-    for section in definition.split(_IDL_SEPARATOR)[1:]:
-        found.update(get_types_from_idl(section.split("\n", 1)[1]))
-    return found
+    texts = [section.split("\n", 1)[1] for section in definition.split(_SEPARATOR)[1:]] or [definition]
+    found = {name: described for text in texts for name, described in get_types_from_idl(text).items()}
+    return {name: _read_rosbags_fields(*described) for name, described in found.items()}
+
+
+def _read_rosbags_fields(_constants: Any, fields: list[tuple[str, Any]]) -> FieldTypes:
+    """Return the fields of a message as rosbags describes them; `ValueError` for types that ROS does not have."""
+    return tuple((name, _read_rosbags_type(*described)) for name, described in fields)
+
+
+def _read_rosbags_type(kind: Nodetype, argument: Any) -> FieldType:
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        (inner, length), fixed = argument, kind == Nodetype.ARRAY
+        if inner[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            raise ValueError("arrays of arrays are not supported")
+        return replace(_read_rosbags_type(*inner), length=length, fixed=fixed)
+    if kind == Nodetype.NAME:
+        return FieldType(argument)
+    if argument[0] not in BASE_TYPES:
+        raise ValueError(f"fields of type {argument[0]} are not supported")
+    return FieldType(*argument)
 
 
 @functools.cache
-def _load_rosbags_definitions(*, ros1: bool) -> _Definitions:
+def _load_rosbags_definitions(*, ros1: bool) -> dict[str, Any]:
     return dict(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE).fielddefs)
 
 
@@ -328,27 +300,6 @@ def _read_definitions_of_directory(directory: Path) -> _Definitions:
     if not found:
         raise LogError(f"{directory}: no .msg or .idl file below it; expected package/msg/Name.msg")
     return found
-
-
-def _iterate_flat_values(message: object, record: Record, prefix: str) -> Iterable[tuple[str, Any]]:
-    for name, wire_type in record.fields:
-        value = getattr(message, normalize_fieldname(name))
-        if isinstance(wire_type, Record):
-            yield from _iterate_flat_values(value, wire_type, f"{prefix}{name}.")
-        else:
-            yield prefix + name, _to_plain(value, wire_type)
-
-
-def _to_plain(value: Any, wire_type: WireType) -> Any:
-    match wire_type:
-        case Record():
-            return {
-                name: _to_plain(getattr(value, normalize_fieldname(name)), field) for name, field in wire_type.fields
-            }
-        case Array() if not isinstance(wire_type.element, Scalar):
-            return [_to_plain(item, wire_type.element) for item in value]
-        case _:
-            return value
 
 
 @cache

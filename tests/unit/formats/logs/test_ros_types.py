@@ -1,6 +1,7 @@
 """Definitions found, completed, and refused."""
 
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from tcpipe.formats.logs.ros_types import DefinitionError, TypeLibrary
 from tcpipe.logs.wire_types import Array, Record, Scalar, Text
@@ -16,26 +17,14 @@ def resolve(text, name=THING, *, ros1=False, schema_encoding="ros2msg"):
     return found
 
 
-def test_what_rosbags_makes_no_type_of_is_decoded_row_by_row_all_the_same():
-    found = resolve("uint8 KIND=3\nuint8 KIND=4\nuint8 value\n")  # it refuses the constants, which take no bytes
-    assert found.row_decoder("cdr")(b"\0\1\0\0\7") == {"value": 7}
-
-
-_ODD = "acme_msgs/Part';print('run');'"
-
-
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("acme_msgs/msg/Thing:\n  pass\nprint('run')\nclass A", "uint8 x\n"),
-        ("acme_msgs/msg/Thing", f"{_ODD} part\n{SEPARATOR}MSG: {_ODD}\nuint8 x\n"),
-        ("acme_msgs/msg/Thing", f"{_ODD}[] parts\n{SEPARATOR}MSG: {_ODD}\nuint8 x\n"),
-    ],
-)
-def test_no_name_in_a_log_becomes_code(name, text, capsys):
-    with pytest.raises(DefinitionError):
-        resolve(text, name=name).row_decoder("cdr")
-    assert capsys.readouterr().out == ""
+@pytest.mark.parametrize(("edition", "version"), [(Stores.ROS1_NOETIC, 1), (Stores.ROS2_HUMBLE, 2)])
+def test_the_text_of_a_bundled_definition_is_what_rosbags_writes(edition, version):
+    store = get_typestore(edition)
+    for name in ("nav_msgs/msg/Odometry", "diagnostic_msgs/msg/DiagnosticArray", "std_msgs/msg/Empty"):
+        expected, _ = store.generate_msgdef(name, ros_version=version)
+        constants = [f"{kind} {constant}={value}" for constant, kind, value in store.fielddefs[name][0]]
+        lines = [line for line in expected.splitlines() if line not in constants and "=" not in line.strip("=")]
+        assert resolve("", name=name, ros1=version == 1).text(ros1=version == 1).splitlines() == lines
 
 
 def test_parts_that_the_log_leaves_out_come_from_the_bundled_definitions():
