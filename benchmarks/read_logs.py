@@ -97,7 +97,7 @@ def floor(path: Path, _topics: list[str]) -> None:
     """Read every chunk of an .mcap and decompress it, as the reader does, and nothing else."""
     part, source = McapPart(path, path.name), ByteSource(path)
     for chunk in part._contents.chunks:  # noqa: SLF001
-        data = source.read_once(chunk.data_offset, chunk.data_bytes)
+        data = source.read(chunk.data_offset, chunk.data_bytes)
         if chunk.compression:
             decompress(chunk.compression, data, chunk.uncompressed_bytes, checked=True)
 

@@ -385,7 +385,7 @@ class BagPart(ChunkedPart[_Chunk]):
             return kept
         if record.end > self._bytes.size:
             raise DamageError("file-cut")
-        data = self._bytes.read_once(record.data_offset, record.data_bytes)
+        data = self._bytes.read(record.data_offset, record.data_bytes)
         return data if codec == "none" else decompress(codec, data, size)
 
     def _read_index(self) -> None:

@@ -52,20 +52,8 @@ class Entries:
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
-    """Chunks to read together: their numbers in the group, and the wanted messages (None: only the records show them).
-
-    A ``compact`` one keeps only the pieces with wanted messages; others are single chunks, kept whole.
-    """
-
-    chunks: range
-    entries: Entries | None
-    compact: bool
-
-
-@dataclass(frozen=True, slots=True)
 class Excerpt:
-    """Bytes in which a span's messages lie: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,)."""
+    """Pieces of chunks one after another: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,)."""
 
     data: memoryview
     offset: Ints
@@ -180,7 +168,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
 
     @abstractmethod
     def load(self, chunk: AnyChunk) -> memoryview:
-        """Return all records of a chunk, valid until the next read; of a chunk cut by the file's end, what remains."""
+        """Return all records of a chunk; of one cut by the file's end, what remains."""
 
     @abstractmethod
     def find_plain_data(self, chunk: AnyChunk) -> int | None:
@@ -213,8 +201,8 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
             members = chunks[group.start : group.stop]
             sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
             entries, sound = self.entries([chunk for _, chunk in members], sizes)
-            for span in plan_chunk_spans(entries, sizes, sound, sorted(wanted)):
-                yield from self._read_span_blocks(span, members, wanted)
+            entries = entries.at(np.isin(entries.channel, sorted(wanted)))
+            yield from self._read_group(entries, sound, members, wanted)
 
     def entries(self, chunks: list[AnyChunk], sizes: Ints) -> tuple[Entries, Mask]:
         """Return the messages of chunks of ``sizes`` bytes by their indexes, and which chunks have a valid index."""
@@ -223,21 +211,19 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         sound[unsound] = False
         return entries, sound
 
-    def _read_span_blocks(
-        self, span: Span, members: list[tuple[int, AnyChunk]], wanted: frozenset[int]
+    def _read_group(
+        self, entries: Entries, sound: Mask, members: list[tuple[int, AnyChunk]], wanted: frozenset[int]
     ) -> Iterator[MessageBlock]:
-        """Yield the wanted messages of a span; what is lost or contradicts itself is added to ``damage``."""
-        doubtful: Sequence[int] = span.chunks
-        if span.entries is not None:
-            found = self.read_excerpt(span, span.entries, [chunk for _, chunk in members])
-            messages, true = self.read_indexed(found)
-            ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
-            doubtful = np.unique(found.entries.chunk[~true]).tolist()
-            if doubtful:
-                right = ~np.isin(found.entries.chunk, doubtful)
-                messages, ordinal = messages.at(right), ordinal[right]
-            yield from self._split_in_time(messages, ordinal)
-        for number in doubtful:
+        """Yield the wanted messages of chunks; what is lost or contradicts itself is added to ``damage``."""
+        found = self.read_excerpt(entries, [chunk for _, chunk in members])
+        messages, true = self.read_indexed(found)
+        ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
+        doubtful = np.unique(found.entries.chunk[~true])
+        if len(doubtful):
+            right = ~np.isin(found.entries.chunk, doubtful)
+            messages, ordinal = messages.at(right), ordinal[right]
+        yield from self._split_in_time(messages, ordinal)
+        for number in np.union1d(doubtful, np.flatnonzero(~sound)).tolist():
             base, chunk = members[number]
             try:
                 data = self.load(chunk)
@@ -245,20 +231,17 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
                 self.note_lost(chunk, error)
                 continue
             messages = self.read_walked(chunk, data, wanted)
-            entries = None if span.entries is None else span.entries.at(span.entries.chunk == number)
-            self._note_index_disagreement(chunk, messages, entries)
+            indexed = entries.at(entries.chunk == number) if sound[number] else None
+            self._note_index_disagreement(chunk, messages, indexed)
             yield from self._split_in_time(messages, base + messages.offset)
 
-    def read_excerpt(self, span: Span, entries: Entries, chunks: Sequence[AnyChunk]) -> Excerpt:
-        """Return the messages of a span with the bytes in which they lie, but for those of chunks that are lost."""
-        pieces, offset, size = lay_out_pieces(entries) if span.compact else ({}, entries.offset, 0)
+    def read_excerpt(self, entries: Entries, chunks: Sequence[AnyChunk]) -> Excerpt:
+        """Return the messages of chunks with the bytes in which they lie, but for those of chunks that are lost."""
+        pieces, offset, size = lay_out_pieces(entries)
         data, lost = np.empty(size, np.uint8).data, []
-        for number in span.chunks:
+        for number, of_chunk in pieces.items():
             try:
-                if span.compact:
-                    self._copy(chunks[number], pieces.get(number, []), data)
-                else:
-                    data = self.load(chunks[number])
+                self._copy(chunks[number], of_chunk, data)
             except DamageError as error:
                 lost.append(number)
                 self.note_lost(chunks[number], error)
@@ -328,26 +311,6 @@ def sort_by_place(
     sound[chunk[end - offset < least_bytes]] = False
     entries = Entries(chunk, channel, offset, end, log_time_ns)
     return (entries if sound.all() else entries.at(sound[chunk])), sound
-
-
-def plan_chunk_spans(entries: Entries, sizes: Ints, sound: Mask, wanted: Sequence[int]) -> Iterator[Span]:
-    """Yield, in order, how to read the chunks of a group: those of which little is wanted together, others one by one.
-
-    ``entries`` are the messages of those whose index is sound; ``sizes`` [byte] and ``sound`` are of all chunks, shape
-    (M,).
-    """
-    entries = entries.at(np.isin(entries.channel, wanted))
-    wanted_bytes = np.bincount(entries.chunk, entries.end - entries.offset, len(sizes))
-    sparse = (sound & (2 * wanted_bytes <= sizes)).tolist()
-    bounds = np.searchsorted(entries.chunk, np.arange(len(sizes) + 1)).tolist()
-    first = 0
-    while first < len(sparse):
-        after = first + 1
-        while sparse[first] and after < len(sparse) and sparse[after]:
-            after += 1
-        chosen = entries.at(slice(bounds[first], bounds[after])) if sound[first] else None
-        yield Span(range(first, after), chosen, sparse[first])
-        first = after
 
 
 def lay_out_pieces(entries: Entries) -> tuple[dict[int, list[Piece]], Ints, int]:

@@ -183,7 +183,6 @@ class ByteSource:
         self._file, self._fetched = path.open("rb"), fetched
         self.size = os.fstat(self._file.fileno()).st_size
         self._peeked = 0, b""
-        self._scratch = bytearray()
 
     def read(self, offset: int, size: int) -> memoryview:
         """Return ``size`` bytes at ``offset``; raise `DamageError` where the file ends before."""
@@ -197,22 +196,12 @@ class ByteSource:
             data += more
         return memoryview(data)
 
-    def read_once(self, offset: int, size: int) -> memoryview:
-        """Return bytes as `read` does, valid until the next call, which reuses their memory (still in the cache)."""
-        if size < 0 or offset + size > self.size:
-            raise DamageError("file-cut")
-        if len(self._scratch) < size:
-            self._scratch = bytearray(size)
-        view = memoryview(self._scratch)[:size]
-        return view if self._fill(view, offset) else self.read(offset, size)
-
     def read_pieces(self, pieces: Sequence[tuple[int, memoryview]]) -> None:
         """Fill each view with the bytes at its offset; what lies between them is not read. `DamageError` as `read`."""
         self.skips()
         self.expect([(offset, len(view)) for offset, view in pieces])
         for offset, view in pieces:
-            if not self._fill(view, offset):
-                view[:] = self.read(offset, len(view))
+            view[:] = self.read(offset, len(view))
 
     def peek(self, offset: int, size: int) -> bytes:
         """Return up to ``size`` bytes at ``offset`` (fewer at the end); fast for many small, mostly ascending reads."""
@@ -265,17 +254,6 @@ class ByteSource:
             return self._fetched.read(offset, size)
         try:
             return os.pread(self._file.fileno(), size, offset)
-        except OSError as error:
-            raise DamageError("data-unreadable", str(error.strerror)) from None
-
-    def _fill(self, view: memoryview, offset: int) -> bool:
-        """Read the bytes at ``offset`` into a view; return whether there were enough."""
-        if self._fetched is not None and not self._fetched.is_whole:
-            data = self._fetched.read(offset, len(view))
-            view[: len(data)] = data
-            return len(data) == len(view)
-        try:
-            return os.preadv(self._file.fileno(), [view], offset) == len(view)
         except OSError as error:
             raise DamageError("data-unreadable", str(error.strerror)) from None
 

@@ -55,8 +55,6 @@ from tcpipe.logs.topics import Topic, compute_silence_ns, normalize_type_name
 
 _LOOSE_BYTES = 1 << 22
 """Messages outside chunks are read in runs of about this size."""
-_AT_ONCE = 256
-"""The heads of so many chunks are looked at together."""
 
 
 class McapPart(ChunkedPart[Chunk]):
@@ -70,7 +68,8 @@ class McapPart(ChunkedPart[Chunk]):
         """By channel, how many messages a walk met, the first and the last log time."""
         self._untimed = 0
         self._complete = False
-        self._without_crc: set[int] = set()
+        self.is_unchecked = False
+        """Whether chunks were read that carry no CRC."""
         try:
             if self._bytes.peek(0, len(MAGIC)) != MAGIC:
                 self._note("record-damaged", 0, messages_lost=0)
@@ -89,7 +88,6 @@ class McapPart(ChunkedPart[Chunk]):
             self._bounds.claim(chunk.size for chunk in self._contents.chunks)
             self._count_messages()
         self._bounds.count(len(self._contents.chunks), len(self._contents.channels))
-        self._note_twins()
         return {number: self._topic(number) for number in sorted(self._contents.channels)}
 
     @property
@@ -97,17 +95,11 @@ class McapPart(ChunkedPart[Chunk]):
         """A hash of the file's size and summary; "" where it is read without one."""
         return self._contents.outline
 
-    @property
-    def is_unchecked(self) -> bool:
-        """Whether chunks were read that carry no CRC."""
-        return bool(self._without_crc)
-
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels."""
         if not self._complete:
             self._fill_gaps()
         yield from super().blocks(wanted)
-        self._note_odd_ones_without_crc()
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
         """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
@@ -162,7 +154,7 @@ class McapPart(ChunkedPart[Chunk]):
         """Return where the records of a chunk begin that is neither compressed nor has a CRC."""
         if chunk.compression or self._crc(chunk):
             return None
-        self._without_crc.add(chunk.offset)
+        self.is_unchecked = True
         return chunk.data_offset
 
     def _crc(self, chunk: Chunk) -> int:
@@ -171,35 +163,11 @@ class McapPart(ChunkedPart[Chunk]):
             return 0
         return int.from_bytes(self._bytes.read(chunk.offset + CHUNK_CRC, 4), "little")
 
-    def _note_twins(self) -> None:
-        """Note chunks of one content: one was written over another, where times, sizes and CRC are the same."""
-        heads: dict[tuple[int, int, int], Chunk] = {}
-        for chunk in self._contents.chunks:
-            if chunk.headless or chunk.cut:
-                continue
-            twin = heads.setdefault((chunk.start_ns, chunk.end_ns, chunk.uncompressed_bytes), chunk)
-            with suppress(DamageError):
-                if twin is not chunk and self._crc(chunk) and self._crc(chunk) == self._crc(twin):
-                    self._note("chunk-suspect", chunk.offset)
-
-    def _note_odd_ones_without_crc(self) -> None:
-        """Note the chunks that were read without a CRC if other chunks of the file have one: it may be overwritten."""
-        odd = [chunk for chunk in self._contents.chunks if chunk.offset in self._without_crc and not chunk.headless]
-        others = [chunk for chunk in self._contents.chunks if chunk.offset not in self._without_crc] if odd else []
-        if any(self._any_crc(others[first : first + _AT_ONCE]) for first in range(0, len(others), _AT_ONCE)):
-            for chunk in odd:
-                self._note("chunk-suspect", chunk.offset)
-
-    def _any_crc(self, chunks: Sequence[Chunk]) -> bool:
-        self._bytes.expect([(chunk.offset, RECORD_HEAD + CHUNK_HEAD) for chunk in chunks])
-        return any(self._crc(chunk) for chunk in chunks)
-
     def load(self, chunk: Chunk) -> memoryview:
         """Return the chunk's records, its CRC checked."""
         crc = self._crc(chunk)
-        if not crc:
-            self._without_crc.add(chunk.offset)
-        data, size = self._bytes.read_once(chunk.data_offset, chunk.data_bytes), chunk.uncompressed_bytes
+        self.is_unchecked |= not crc
+        data, size = self._bytes.read(chunk.data_offset, chunk.data_bytes), chunk.uncompressed_bytes
         if chunk.cut:
             kept = decompress_prefix(chunk.compression, data, size) if chunk.compression else data
             self._note("file-cut", chunk.offset, bytes_lost=size - len(kept))
@@ -275,7 +243,7 @@ class McapPart(ChunkedPart[Chunk]):
             return
         found = 0
         for start in range(0, end, _LOOSE_BYTES):
-            found = crc32(self._bytes.read_once(start, min(_LOOSE_BYTES, end - start)), found)
+            found = crc32(self._bytes.read(start, min(_LOOSE_BYTES, end - start)), found)
         if found != crc:
             self._note("chunk-damaged", end)
 

@@ -13,6 +13,7 @@ from random_messages import (
     write_rosbag2,
 )
 
+from tcpipe.formats.logs import chunk_reading
 from tcpipe.formats.logs.log_file import open_log
 
 LIMIT_BYTES = 40_000
@@ -44,7 +45,8 @@ def test_the_pieces_are_the_tables(tmp_path, kind, ragged):
     assert max(sum(table.nbytes for table in piece.values()) for piece in pieces) < 2 * LIMIT_BYTES
 
 
-def test_rows_swapped_nearby_are_sorted_and_rows_far_behind_are_counted(tmp_path):
+def test_rows_swapped_nearby_are_sorted_and_rows_far_behind_are_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(chunk_reading, "GROUP_BYTES", 4096)
     messages = random_messages(2, count=3000, types=("std_msgs/msg/ColorRGBA",))
     swapped = [message for pair in zip(messages[1::2], messages[::2], strict=True) for message in pair]
     with open_log(write_mcap(tmp_path / "near.mcap", swapped, chunk_bytes=2048)) as log:
