@@ -43,7 +43,7 @@ def make(plan=None, *, placements: bool = True) -> Drive:
     spec = demo.drives[0]
     spec = replace(
         spec,
-        plan=plan or Wander(60.0, (110.0, 30.0)),
+        plan=plan or Wander(40.0, (110.0, 30.0)),
         recorder=replace(spec.recorder, placements=placements),
         faults=replace(Faults.every(), gnss_outage=False, visual_dropouts=False, power_gap=False),
     )

@@ -13,7 +13,7 @@ from tcpipe.simulation.route import Wander
 from tcpipe.simulation.site_files import simulate_messages
 
 NOISE = ("gnss_noise", "wheel_noise", "imu_noise", "visual_noise", "power_noise", "gnss_lever_arm", "imu_mounting")
-LENGTH_M = 50.0
+LENGTH_M = 35.0
 GYROSCOPE, ACCELEROMETER, TWIST = (
     tuple(f"{name}.{axis}" for axis in "xyz")
     for name in ("angular_velocity", "linear_acceleration", "twist.twist.linear")

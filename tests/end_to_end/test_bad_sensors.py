@@ -25,7 +25,7 @@ from tcpipe.tables.levels import LabelledSegments, Streams
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    return make(Wander(45.0, (110.0, 30.0)))
+    return make(Wander(30.0, (110.0, 30.0)))
 
 
 def read(drive: Drive, out: Path, config: ReadConfig | None = None) -> Streams:
@@ -150,12 +150,12 @@ def test_an_imu_that_is_silent_while_the_robot_sets_off_leaves_its_heading_known
     labelled = run(silent, tmp_path)
     assert "imu" in fused(labelled)
     assert not select_findings(labelled.info.report.findings, "gnss-contradicts-odometry")
-    assert_labels_hold(labelled, drive.truth, at_least=38, within=0.012)
+    assert_labels_hold(labelled, drive.truth, at_least=25, within=0.012)
 
 
 def test_an_imu_that_nothing_places_is_refused_and_its_mounting_proposed(tmp_path):
     """The unit is upside down and turned by 90°: the log alone shows both."""
-    drive = make(placements=False)
+    drive = make(Wander(30.0, (110.0, 30.0)), placements=False)
     labelled = run(drive, tmp_path)
     assert refused(labelled) == {"imu"}
     # Without it nothing measures how an antenna sways whose height nobody states: σ holds that.
@@ -238,7 +238,8 @@ UNLIKE = {
 }
 
 
-def test_labels_hold_where_fixes_wander_off(drive, tmp_path):
+def test_labels_hold_where_fixes_wander_off(tmp_path):
+    drive = make(Wander(45.0, (110.0, 30.0)))
     labelled = run(drive.changed("gnss", astray), tmp_path)
     assert "gnss" in {
         of.subject.name for of in select_findings(labelled.info.report.findings, "gnss-contradicts-odometry")
@@ -288,7 +289,7 @@ def test_values_that_are_no_numbers_cost_only_themselves(drive, tmp_path):
         for name, values in columns.items():
             if np.issubdtype(values.dtype, np.floating) and not name.startswith("header") and "covariance" not in name:
                 hit = scattered(len(values), 0.003 if name.startswith("measured_") else 0.03)
-                values[hit] = np.resize((np.nan, np.inf, 1e30, -np.inf), np.count_nonzero(hit))
+                values[hit] = np.resize((np.nan, np.inf, 1e30, -np.inf), values[hit].shape)
                 found[name] = values
         return found
 
@@ -346,15 +347,6 @@ def test_a_current_with_an_offset_is_said(drive, tmp_path):
     other = drive.changed("power", lambda c: {n: v + 50.0 for n, v in c.items() if "current" in n})
     (finding,) = select_findings(run(other, tmp_path).info.report.findings, "idle-power-high")
     assert finding.numbers["idle_watt"] > 0.5 * finding.numbers["driving_watt"]
-
-
-def test_stamps_at_zero_are_taken_from_the_recorder(drive, tmp_path):
-    def unset(columns: Columns) -> Columns:
-        return {name: np.zeros_like(columns[name]) for name in ("header.stamp.sec", "header.stamp.nanosec")}
-
-    labelled = run(drive.changed("gnss", unset).changed("power", unset), tmp_path)
-    assert_labels_hold(labelled, drive.truth)
-    assert len(select_findings(labelled.info.report.findings, "log-time-used")) == 2
 
 
 @pytest.fixture(scope="module")

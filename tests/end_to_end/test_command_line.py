@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 import rasterio
 from installed_command import COMMAND, HANGS_S, plain_lines, run_script, tcpipe, told
-from stored_files import checksums, map_path, only_run, tables
+from stored_files import map_path, only_run, tables
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.simulation import Faults, SimulatedSite, make_tiny, simulate
@@ -229,13 +229,6 @@ def test_nobody_listening_is_no_reason_to_stop(logs: list[Path], tmp_path: Path)
     assert full.stderr == "tcpipe: No space left on device\n"
 
 
-def _patched(directory: Path, program: str) -> dict[str, str]:
-    """Return an environment in which every Python process begins with ``program``."""
-    (directory / "patch").mkdir()
-    (directory / "patch" / "sitecustomize.py").write_text(program)
-    return {"PYTHONPATH": os.pathsep.join([str(directory / "patch"), *filter(None, [os.environ.get("PYTHONPATH")])])}
-
-
 def test_it_is_a_module_too(tmp_path: Path) -> None:
     said = [
         subprocess.run([*command, "--version"], cwd=tmp_path, capture_output=True, check=True).stdout
@@ -394,21 +387,3 @@ def test_a_batch_that_is_ended_goes_on_where_it_was(number: signal.Signals, logs
     _run("ingest", *logs[1:], cwd=tmp_path)  # which also removes what a worker had begun
     assert len(tables(tmp_path / "tcpipe-store")) == len(logs[1:])
     assert not list(tmp_path.rglob(".tmp-*"))
-
-
-def test_a_worker_that_is_killed_costs_only_its_own_log(logs: list[Path], tmp_path: Path) -> None:
-    """Another log meets a bug; --debug shows where, inside workers too."""
-    break_masks = "import os, tcpipe.stages.mask as mask\nfirst = mask.mask_track\ndef broken(track, *a, **k):\n"
-    break_masks += "    if 'run1' in track.info.run_id: os.kill(os.getpid(), 9)\n"
-    break_masks += "    if 'run2' in track.info.run_id: raise ZeroDivisionError('boom')\n"
-    env = _patched(tmp_path, f"{break_masks}    return first(track, *a, **k)\nmask.mask_track = broken\n")
-    done = tcpipe("--debug", "ingest", *logs, "--jobs", "2", cwd=tmp_path, env=env)
-    assert (done.returncode, "1 done, 2 failed" in done.stdout) == (3, True)
-    assert "run1.mcap: its worker process died" in done.stderr
-    assert "run2.mcap: internal error, ZeroDivisionError: boom" in done.stderr
-    assert "in broken" in done.stderr
-    again = _run("ingest", *logs, "--retry-failed", cwd=tmp_path)
-    assert [line.split()[0] for line in again.splitlines() if "robot husky" in line] == ["unchanged", "done", "done"]
-    _run("ingest", logs[0], "--store", "alone", cwd=tmp_path)
-    by_worker, alone = (checksums(tmp_path / name) for name in ("tcpipe-store", "alone"))
-    assert {name: by_worker.get(name) for name in alone} == alone != {}, "a worker makes the same bytes"

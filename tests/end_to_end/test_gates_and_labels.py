@@ -103,8 +103,8 @@ def test_no_segment_contains_standing_or_turning_in_place(manoeuvres):
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory):
-    """Some minutes with every sensor fault, from a ROS 1 bag; the demo of test_whole_pipeline.py is a ROS 2 log."""
-    plan = make_tiny(Faults.every(), recorder=Recorder("ros1", "husky_status"), seconds=160.0)
+    """Two minutes with every sensor fault, from a ROS 1 bag; the demo of test_whole_pipeline.py is a ROS 2 log."""
+    plan = make_tiny(Faults.every(), recorder=Recorder("ros1", "husky_status"), seconds=110.0)
     return run(simulate(tmp_path_factory.mktemp("faulty"), scenario=plan, seed=4))
 
 

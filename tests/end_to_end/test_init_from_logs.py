@@ -24,7 +24,7 @@ HUSKY = {"gnss": "[0.1, 0.0, 0.9]", "imu": "[0.05, -0.1, 0.3], rpy_rad = [3.1416
 
 @pytest.fixture(scope="module")
 def drive():
-    return make(Wander(35.0, (110.0, 30.0)))
+    return make(Wander(25.0, (110.0, 30.0)))
 
 
 def run(*words):

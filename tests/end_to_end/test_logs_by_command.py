@@ -3,19 +3,18 @@
 import json
 import os
 import shutil
-import subprocess
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe, told
+from installed_command import plain_lines, tcpipe, told
 from mcap.writer import Writer
 from storage_server import FORBIDDEN, object_store
 from stored_files import only_run
 from wheel_drives import START_NS, drive_at, wheel_drive
 
 from tcpipe.formats.logs.writing import write_mcap, write_rosbag2
-from tcpipe.store import Store
+from tcpipe.stages import mask
 
 
 @pytest.mark.parametrize(("content", "store"), [(b"nonsense", "tcpipe-store"), (b"#ROSBAG V2.0\n", "deep/down/store")])
@@ -28,6 +27,8 @@ def test_what_cannot_be_ingested_is_known_to_fail_from_then_on(tmp_path, content
     found = told(tcpipe("ingest", "a.bag", "--store", store, "--json", cwd=tmp_path))
     assert (found["store"], found["exit_code"], found["results"][0]["known"]) == (store, 0, True)
     plain_lines(tcpipe("ingest", "a.bag", "--store", store, "--retry-failed", cwd=tmp_path), 1)
+    done = tcpipe("acknowledge", "a.bag", "--store", store, "--json", cwd=tmp_path)
+    assert (done.returncode, len(json.loads(done.stdout)["acknowledged"])) == (0, 1)
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
@@ -61,64 +62,21 @@ def test_the_good_are_done_and_the_bad_are_named(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
-    drive_at(tmp_path / "logs" / "run.mcap")
-    cut, junk = tmp_path / "logs" / "cut.mcap", tmp_path / "logs" / "junk.bag"
-    cut.write_bytes(drive_at(tmp_path / "whole.mcap", seed=1).read_bytes()[:-20_000])
-    junk.write_bytes(b"junk" * 100)
-    assert "logs/junk.bag: not a log" in plain_lines(tcpipe("ingest", "logs", cwd=tmp_path), 3)
-    again = tcpipe("ingest", "logs", "--jobs", "8", "--quiet", cwd=tmp_path)
-    assert (again.returncode, again.stderr) == (0, "")
-    assert again.stdout.splitlines()[-3:] == [
-        "nothing to do: 2 of 3 logs are in tcpipe-store already",
-        "1 log failed before and was skipped; --retry-failed tries it again",
-        "1 log known as damaged or empty; 'tcpipe acknowledge RUN' after you have checked it",
-    ]
-    (run_id,) = {run.run_id for run in Store(tmp_path / "tcpipe-store").runs() if run.run_id.startswith("cut-")}
-    refused = plain_lines(tcpipe("acknowledge", run_id, "nosuch", cwd=tmp_path), 2, most=1)
-    assert (
-        f"nosuch: is no run, log or dataset with a known problem in tcpipe-store; known problems: {junk}, {run_id}"
-        in refused
-    )
-    done = tcpipe("acknowledge", run_id, "logs/junk.bag", cwd=tmp_path)
-    assert (done.returncode, f"acknowledged: {run_id}: " in done.stdout, "[log-damaged]" in done.stdout) == (
-        0,
-        True,
-        True,
-    )
-    assert (
-        json.loads(tcpipe("acknowledge", run_id, "--json", "--store", "tcpipe-store", cwd=tmp_path).stdout)[
-            "acknowledged"
-        ]
-        == []
-    )
-    retried = tcpipe("ingest", "logs", "--retry-failed", cwd=tmp_path)
-    assert (retried.returncode, retried.stdout.splitlines()[-1]) == (0, "2 with acknowledged problems")
+def test_each_log_is_told_as_it_ends(tmp_path, monkeypatch):
+    """The line of the first log is printed before the second one is cut."""
+    for seed, name in enumerate("ab"):
+        drive_at(tmp_path / f"{name}.mcap", seed=seed)
+    mask_track, printed = mask.mask_track, {}
 
+    def look(track, *how, **more):
+        printed[track.info.run_id[0]] = os.pread(1, 100_000, 0).decode()
+        return mask_track(track, *how, **more)
 
-def test_each_log_is_told_as_it_ends(tmp_path):
-    """The second log waits until the line of the first was read."""
-    drive_at(tmp_path / "a.mcap")
-    stuck = "import tcpipe.stages.mask as mask, time, os\nfirst = mask.mask_track\n"
-    stuck += "def waiting(track, *a, **k):\n    while 'b-' in track.info.run_id and not os.path.exists('go'): time.sleep(0.02)\n"
-    (tmp_path / "patch").mkdir()
-    (tmp_path / "patch" / "sitecustomize.py").write_text(
-        stuck + "    return first(track, *a, **k)\nmask.mask_track = waiting\n"
-    )
-    drive_at(tmp_path / "b.mcap", seed=1)
-    running = subprocess.Popen(
-        [COMMAND, "ingest", "a.mcap", "b.mcap", "--json", "--quiet"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "patch"), os.environ.get("PYTHONPATH", "")])},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert running.stdout is not None
-    first = json.loads(running.stdout.readline())
-    assert (first["kind"], first["log"], running.poll()) == ("log", str(tmp_path / "a.mcap"), None)
-    (tmp_path / "go").touch()
-    rest, _ = running.communicate(timeout=HANGS_S)
-    assert [json.loads(line)["kind"] for line in rest.splitlines()] == ["log", "summary"]
+    monkeypatch.setattr(mask, "mask_track", look)
+    done = tcpipe("ingest", "a.mcap", "b.mcap", "--json", "--quiet", "--jobs", "1", cwd=tmp_path)
+    first, *_ = lines = done.stdout.splitlines(keepends=True)
+    assert (printed["a"], printed["b"]) == ("", first)
+    assert [json.loads(line)["kind"] for line in lines] == ["log", "log", "summary"]
 
 
 def test_shares_of_a_folder_and_parts_of_a_bag(tmp_path):

@@ -28,10 +28,10 @@ CODES |= {"motion-without-power"}
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """Streams, masked track and truth of five minutes with halts; power errs afterwards."""
+    """Streams, masked track and truth of three minutes with halts; power errs afterwards."""
     plan = find_scenario("hills12")
     start_m = (14.0, 34.0)
-    spec = replace(plan.drives[0], plan=Wander(220.0, start_m, climbing=0.5), start_m=start_m, faults=NOISY)
+    spec = replace(plan.drives[0], plan=Wander(150.0, start_m, climbing=0.5), start_m=start_m, faults=NOISY)
     single = replace(plan, drives=(spec,), rasters=RasterSpec(1.0, 1.0, 1.0))
     site = simulate(tmp_path_factory.mktemp("power"), scenario=single, seed=7)
     streams = streams_of(site.logs[0])

@@ -14,7 +14,7 @@ from tcpipe.simulation import find_scenario, scenarios
 pytest.importorskip("torch")
 
 ENV = {"OMP_NUM_THREADS": "1"}
-LENGTH_M = 130.0
+LENGTH_M = 100.0
 """Length of the three drives [m]; `tcpipe reproduce --quick` drives 190 m."""
 
 OWN = """

@@ -236,6 +236,8 @@ def test_a_drive_without_a_segment_is_news_once_and_can_be_accepted(tmp_path):
     again = run(*ingest_it)
     assert again.return_value == 0
     assert "(empty, known)" in again.output
+    hint = "1 log known as damaged or empty; 'tcpipe acknowledge RUN' after you have checked it"
+    assert hint in again.output.splitlines()
     shown = run("status", *how)
     assert (shown.return_value, "1 empty" in shown.output) == (3, True)
     assert "1 of 1 runs: No segments [no-segments]" in shown.output
