@@ -166,8 +166,9 @@ def test_a_drive_that_was_recorded_in_two_pieces_is_one_and_a_short_one_after_it
 OTHER_TOPIC = {"drive": 1, "topic": "/gps/fix"}
 
 
-@pytest.mark.parametrize("fixes", [OTHER_TOPIC, None])
-@pytest.mark.parametrize(("answer", "samples"), [("two_robots", 40), ("one_drive", 20)])
+@pytest.mark.parametrize(
+    ("fixes", "answer", "samples"), [(OTHER_TOPIC, "two_robots", 40), (None, "two_robots", 40), (None, "one_drive", 20)]
+)
 def test_runs_without_a_sensor_in_common_are_asked_for_and_a_tag_is_the_answer(store, tmp_path, fixes, answer, samples):
     add(store, start_ns=10**18, fixes={})
     add(store, "b", (1.5,), start_ns=10**18, fixes=fixes)

@@ -128,29 +128,40 @@ def test_a_file_of_others_that_the_new_dataset_would_replace_is_kept(here):
     assert path.read_text() == "mine"
 
 
-CAUSES = {
-    "covariates": ({"covariates": "soil.csv"}, {}, ("covariates: removed soil.csv",)),
-    "content of covariates": ({"covariates": "soil.csv"}, {"covariates": "wet/soil.csv"}, ("covariates: soil.csv is another one",)),
-    "chosen tags": ({"tag": {"weather": "dry"}}, {"tag": {}},
-    ("run: added wet", "chosen tags: weather dry → none")),
-    "order of maps": ({"map": ["site", "yard"]}, {"map": ["yard", "site"]}, ("order of maps: site, yard → yard, site",)),
-    "map": ({"map": "site"}, {"map": "yard"}, ("map: added yard", "map: removed site", "order of maps: site → yard")),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", CAUSES)
-def test_diff_names_every_input_that_differs(here, name):
-    """Each entry of the record of inputs, not a list of some of them."""
+@pytest.fixture(scope="module")
+def variants(made, tmp_path_factory):
+    """The dataset of the dry run, and such of other inputs."""
+    here = shutil.copytree(made, tmp_path_factory.mktemp("variants") / "here")
     (here / "wet").mkdir()
     (here / "wet" / "soil.csv").write_text((here / "soil.csv").read_text().replace("0.2", "0.4"))
-    *options, causes = CAUSES[name]
-    for out, how in zip("ab", options, strict=True):
-        paths = {key: here / value if key in ("covariates", "split") else value for key, value in how.items()}
-        build_dataset(here / out, **usual(here, **paths))
-    found = diff(here / "a", here / "b")
-    assert set(found.causes) == set(causes)
+    options = {
+        "soil": {"covariates": here / "soil.csv"},
+        "wet soil": {"covariates": here / "wet" / "soil.csv"},
+        "all": {"tag": {}},
+        "both": {"map": ["site", "yard"]},
+        "turned": {"map": ["yard", "site"]},
+        "yard": {"map": "yard"},
+    }
+    for name, how in options.items():
+        build_dataset(here / name, **usual(here, **how))
+    return here
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "causes"),
+    [
+        ("soil", "dataset", {"covariates: removed soil.csv"}),
+        ("soil", "wet soil", {"covariates: soil.csv is another one"}),
+        ("dataset", "all", {"run: added wet", "chosen tags: weather dry → none"}),
+        ("both", "turned", {"order of maps: site, yard → yard, site"}),
+        ("dataset", "yard", {"map: added yard", "map: removed site", "order of maps: site → yard"}),
+    ],
+)
+def test_diff_names_every_input_that_differs(variants, one, other, causes):
+    """Each entry of the record of inputs, not a list of some of them."""
+    found = diff(variants / one, variants / other)
+    assert set(found.causes) == causes
     assert not found.same
-    assert diff(here / "a", here / "a").same
 
 
 def test_the_record_of_inputs_is_read_as_it_was_written(here):
