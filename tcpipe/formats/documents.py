@@ -225,6 +225,7 @@ Beginning: TypeAlias = tuple[str, str, int, str]
 
 
 def _find_beginning(row: RunFacts) -> Beginning | None:
+    """Return what identifies the beginning of a run's log; None if the run was pruned or has no measurements."""
     if row.recording is None or not row.blob:  # what was pruned takes the place of nothing
         return None
     return row.robot, row.ingest_key, row.recording.first_ns, row.recording.beginning

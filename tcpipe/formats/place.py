@@ -102,7 +102,7 @@ class Place:
         def read(path: Path) -> bytes:
             if path.stat().st_size <= _MAX_BYTES:
                 return path.read_bytes()
-            raise StoreError(f"{path}: is larger than {_MAX_BYTES >> 20} MB, which no document or page is; remove it")
+            raise StoreError(f"{path}: is larger than {_MAX_BYTES >> 20} MB, the most that tcpipe writes; remove it")
 
         with suppress(MissingFileError):
             return self._do(name, read, lambda store, key: bytes(store.get(key).bytes()))

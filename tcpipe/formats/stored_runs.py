@@ -60,7 +60,7 @@ class StoredRun:
         return self.place.below(f"{BLOBS}/{self.facts.blob}")
 
     def file(self, name: str) -> Path:
-        """Return ``track.parquet`` and such on this machine, verified; `StoreError` if it is not as it was written."""
+        """Return a local path of a table, as ``track.parquet``, after a check of its checksum; `StoreError` if it differs."""
         checksum = self.facts.tables.get(name)
         if checksum is None:
             raise StoreError(f"run {self.name}: its manifest lists no {name}; ingest the log again with --force")

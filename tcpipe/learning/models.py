@@ -191,7 +191,7 @@ def _add_code(model: Model, predictor: str | None) -> Model:
         raise UsageError(f"{model.name}: a model of kind {training.kind} needs no code; remove --predictor")
     if predictor is None:
         raise UsageError(
-            f"{model.name}: was trained with code of your own, which no folder has: give it with --predictor FILE.py"
+            f"{model.name}: was trained with your own code, which its folder lacks; give it with --predictor FILE.py"
         )
     own = load_own_kind(predictor)
     if own.digest != training.config.predictor:

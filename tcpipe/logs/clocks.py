@@ -197,7 +197,7 @@ def _bring_to_log_clock(times: TopicTimes) -> Ints:
 def _settle_after_setting_back(
     topics: Mapping[str, TopicTimes], spans: Sequence[tuple[int, int, float]]
 ) -> AlignedClocks:
-    """Return the timelines without messages of times that the clock passed twice, since their order is unknown."""
+    """Return timelines after a clock was set back, without messages in ``spans``: their order is unknown."""
     kept = {
         name: np.flatnonzero(~np.any([(a <= topic.log_time_ns) & (topic.log_time_ns < b) for a, b, _ in spans], axis=0))
         for name, topic in topics.items()

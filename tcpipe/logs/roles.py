@@ -569,7 +569,7 @@ def _list_questions(decided: _Decisions) -> list[str]:
 
 
 def _find_no_motion(decided: _Decisions, topics: Sequence[Topic]) -> tuple[list[str], list[Finding]]:
-    """Return what is wrong where no topic holds motion, and the finding that proposes a topic that was left out."""
+    """If no topic has motion, return lines of the error, and a finding that proposes an unused topic."""
     if any(role in decided.roles or role in decided.undecided for role in MOTION_ROLES):
         return [], []
     findings = []

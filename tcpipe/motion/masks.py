@@ -131,7 +131,7 @@ def _find_moment(command: Floats, before_mps: float, after_mps: float, *, step_m
 
 
 def find_below_full_speed(rows: MotionRows, *, limit_mps: float, window_s: float) -> Mask:
-    """Return rows commanded slower than the limit, by their own and the surrounding mean command (joystick jitter)."""
+    """Mark rows whose command, and its mean over the window around them, is below the limit: a joystick jitters."""
     part, command = _select_known_command(rows)
     speed = np.abs(command)
     half = rows.count(window_s / 2)

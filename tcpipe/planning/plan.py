@@ -160,7 +160,7 @@ def plan_path(
 
 
 def _judge(cost: PathCost, objective: Objective, risk: float | None) -> float:
-    """Return what a path costs in the objective's unit, and is not exceeded with the probability ``risk``."""
+    """Return the expected cost of a path, in the objective's unit; with ``risk`` its quantile of that probability."""
     if objective == "distance":
         return cost.totals.length_m
     quantity = "energy" if objective == "energy" else "duration"

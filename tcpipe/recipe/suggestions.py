@@ -30,7 +30,7 @@ class RecipeFragment:
     is_checked: bool = False
 
     def __post_init__(self) -> None:
-        """Check it as a recipe that holds nothing else."""
+        """Check that the fragment alone is a valid recipe."""
         if not self.is_checked:
             try:
                 from_values(Recipe, tomllib.loads(self.toml().replace(TO_MEASURE, "0.0")), where="suggested recipe")

@@ -176,7 +176,7 @@ def _make_data(
 
 
 def _find_run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
-    """Return the relative address of each run's page, for runs of a store in ``beside``."""
+    """Return the relative address of the page of each of the card's runs that a store in ``beside`` has, by run id."""
     wanted, found = {(run.run_id, run.recipe_id) for run in card.runs}, dict[str, str]()
     for path in sorted(runs.parent for runs in beside.glob("*/runs")):
         with suppress(StoreError, UsageError):  # no store that can be read

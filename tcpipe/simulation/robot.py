@@ -174,9 +174,9 @@ Heading = tuple[Floats, Floats]
 def compute_rolling_resistance(
     world: World, robot: SimulatedRobot, x: Floats, y: Floats, yaw_map_rad: Floats
 ) -> Floats:
-    """Return the traction force over the normal force at poses in the map, any shapes that broadcast.
+    """Return rolling resistance (traction force over normal force) at poses in the map; arrays broadcast.
 
-    Without `Wheels` it is the mean along the wheelbase, under the middle; with them the mean of four contacts.
+    It is the mean at four wheel contacts; without `Wheels`, at five points of the centre line of the wheelbase.
     """
     ahead = robot.wheelbase_m / 2.0
     if robot.wheels is None:

@@ -244,7 +244,7 @@ class Ellipse:
     rotation_rad: float = 0.0
 
     def depth_m(self, u: Floats, v: Floats) -> Floats:
-        """Return the depth inside, as the protocol says."""
+        """Return the depth [m] of points inside the border; negative outside."""
         c, s = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
         a = (c * (u - self.x_m) + s * (v - self.y_m)) / self.x_radius_m
         b = (c * (v - self.y_m) - s * (u - self.x_m)) / self.y_radius_m
@@ -270,7 +270,7 @@ class Band:
     phase_rad: float = 0.0
 
     def depth_m(self, u: Floats, v: Floats) -> Floats:
-        """Return the depth inside, as the protocol says."""
+        """Return the depth [m] of points inside the border; negative outside."""
         c, s = np.cos(self.direction_rad), np.sin(self.direction_rad)
         along, across = c * (u - self.x_m) + s * (v - self.y_m), c * (v - self.y_m) - s * (u - self.x_m)
         k = 2.0 * np.pi / self.wavelength_m

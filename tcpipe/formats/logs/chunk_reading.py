@@ -188,7 +188,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
 
     @abstractmethod
     def needs_index(self, chunk: AnyChunk) -> bool:
-        """Tell whether a broken index of this chunk is noted."""
+        """Return whether a broken index of this chunk counts as damage of the log."""
 
     @abstractmethod
     def note_lost(self, chunk: AnyChunk, error: DamageError) -> None:

@@ -323,7 +323,7 @@ def read_summary(source: ByteSource) -> Contents:
 
 
 def _check(contents: Contents, file_bytes: int) -> None:
-    """Raise `DamageError` if the summary lacks what a reader needs, with the cause if it contradicts the file."""
+    """Raise `DamageError` if the summary is incomplete; of cause ``index-damaged`` if chunks overlap or exceed the file."""
     indexed = {channel for chunk in contents.chunks for channel in chunk.index or ()}
     counted = contents.statistics.messages_by_channel if contents.statistics else {}
     if (

@@ -87,7 +87,7 @@ def test_the_command_takes_it_and_a_folder_alone_runs_nothing(place, tmp_path):
         assert command(*asked, cwd=here).returncode == 0
     done = command("predict-path", model, "--path", "path.geojson", "--store", store, cwd=here)
     assert done.returncode == 2
-    assert "was trained with code of your own, which no folder has: give it with --predictor FILE.py" in done.stderr
+    assert "was trained with your own code, which its folder lacks; give it with --predictor FILE.py" in done.stderr
     assert not any("by_hand" in path.read_text(errors="ignore") for path in model.iterdir())
 
 
