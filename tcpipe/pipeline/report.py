@@ -209,8 +209,8 @@ def _iterate_failed(state: State) -> Iterator[FailedLog]:
             names.add(name := " + ".join(failure.log))
             acknowledged = is_acknowledged([make_failure(failure.content, failure.log)], state)
             yield FailedLog(
-                name, "".join(failure.problems[:1]), "acknowledged" if acknowledged else "failed for what it holds"
+                name, "".join(failure.problems[:1]), "acknowledged" if acknowledged else "failed permanently"
             )
     for name, why in list_transient_failures([call for _, call in state.calls]).items():
         if name not in names:
-            yield FailedLog(name, why, "failed for now")
+            yield FailedLog(name, why, "failed temporarily")

@@ -31,8 +31,8 @@ from tcpipe.tables.findings import Finding
 _MOST_NAMES = 3
 _MOST_CALLS = 7
 _IN_WORDS: Mapping[LogState, str] = {
-    "failed_permanent": "failed for what it holds",
-    "failed_transient": "failed for now",
+    "failed_permanent": "failed permanently",
+    "failed_transient": "failed temporarily",
 }
 
 

@@ -122,7 +122,7 @@ def test_what_failed_is_named_until_its_content_gives_a_run_or_a_person_acknowle
     _, html, *_ = shown(store)
     part = html.split("<h2>Failed, damaged and empty</h2>")[1].split("</section>")[0]
     assert "is no log" in part
-    assert "failed for what it holds" in part
+    assert "failed permanently" in part
     assert "passing.mcap" in part
     assert "was cut" not in part  # the run of that content is there
     assert "b.mcap" not in part
