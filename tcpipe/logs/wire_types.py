@@ -22,8 +22,6 @@ from tcpipe.logs.topics import normalize_type_name
 
 MAX_COLUMNS = 20_000
 """Most leaves of an unfolded definition [1]; a larger one is refused (nested arrays grow exponentially)."""
-MAX_FIXED_ELEMENTS = 100_000
-"""A definition whose fixed arrays hold more texts or messages than this is refused."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,48 +65,6 @@ def count_leaves(wire_type: WireType) -> int:
             return count_leaves(wire_type.element)
         case _:
             return 1
-
-
-def count_fixed_elements(wire_type: WireType) -> int:
-    """Return how many texts and messages the type's fixed arrays hold at least, arrays within arrays multiplied."""
-    match wire_type:
-        case Record():
-            return sum(count_fixed_elements(field) for _, field in wire_type.fields)
-        case Array(element=Text() | Record() as element, length=int() as length):
-            return length * max(count_fixed_elements(element), 1)
-        case Array():
-            return count_fixed_elements(wire_type.element)
-        case _:
-            return 0
-
-
-def compute_least_bytes(wire_type: WireType, *, empty_bytes: int) -> int:
-    """Return how many bytes a value takes at least, alignment aside; a message without fields takes ``empty_bytes``."""
-    match wire_type:
-        case Scalar():
-            return 1
-        case Text() | Array(length=None):
-            return 4
-        case Record():
-            if not wire_type.fields:
-                return empty_bytes
-            return sum(compute_least_bytes(field_type, empty_bytes=empty_bytes) for _, field_type in wire_type.fields)
-        case Array():
-            return (wire_type.length or 0) * compute_least_bytes(wire_type.element, empty_bytes=empty_bytes)
-
-
-def is_boundless(wire_type: WireType, *, empty_bytes: int) -> bool:
-    """Return whether a message could hold any number of elements in no bytes at all."""
-    match wire_type:
-        case Record():
-            return any(is_boundless(field_type, empty_bytes=empty_bytes) for _, field_type in wire_type.fields)
-        case Array():
-            weightless = wire_type.length is None and not compute_least_bytes(
-                wire_type.element, empty_bytes=empty_bytes
-            )
-            return weightless or is_boundless(wire_type.element, empty_bytes=empty_bytes)
-        case _:
-            return False
 
 
 def make_record(name: str, fields: tuple[tuple[str, WireType], ...]) -> Record:
@@ -374,7 +330,7 @@ class _Cursors:
     def array(self, array: Array, rows: Ints) -> Values:
         counts = self.count(rows) if array.length is None else array.length
         is_regular = _find_regular_size(array.element, self._dialect.max_alignment)[0] > 0
-        most = np.inf if is_regular or array.length is not None else _MAX_ELEMENTS
+        most = np.inf if is_regular else _MAX_ELEMENTS
         if isinstance(self._bases, Grid) and len(rows):
             if counts > min(self._sizes[0] - self._at, most):  # an element takes a byte at least
                 raise LayoutError(f"{counts} elements")

@@ -1,7 +1,7 @@
 """Serialised messages of one topic to Arrow columns.
 
-`tcpipe.logs.wire_types` walks some thousand payloads at once. Those of equal length are gathered apart: most have one
-shape, and a field of all of them is a strided view.
+`tcpipe.logs.wire_types` walks some thousand payloads at once. If all have one length, a field of all of them is a
+strided view.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Bytes, Ints, Mask
-from tcpipe.formats.logs.log_part import MessageBlock, gather_integers, group_by_key
+from tcpipe.formats.logs.log_part import MessageBlock, gather_integers
 from tcpipe.formats.logs.ros_types import MessageType
 from tcpipe.logs.wire_types import (
     CDR,
@@ -36,8 +36,6 @@ from tcpipe.tables.columns import number_column
 
 FLUSH_BYTES = 1 << 21
 """Size of the payloads that are converted to columns together [byte]; they fit into the processor's cache."""
-MIN_GROUP = 512
-"""Fewer messages of equal length, among others, are not worth a walk of their own."""
 MAX_CONTIGUOUS_BYTES = 1 << 30
 """A larger table stays in pieces: Arrow's lists and strings count their values in 31 bits."""
 
@@ -85,7 +83,6 @@ class TopicTable:
         self._gathered: list[tuple[_Int64, Bytes, _Int64]] = []
         """Rows of messages, their payloads one after the other, and how long each is."""
         self._gathered_bytes = 0
-        self._scratch = np.zeros(0, np.uint8)
         self._times: list[tuple[_Int64, _Int64, _Int64]] = []
         self._parts: list[tuple[_Int64, pa.Table]] = []
         self._rows = 0
@@ -162,22 +159,18 @@ class TopicTable:
         if not self._gathered:
             return
         rows, lengths = (np.concatenate([piece[at] for piece in self._gathered]) for at in (0, 2))
-        if self._gathered_bytes > len(self._scratch):
-            self._scratch = np.empty(self._gathered_bytes, np.uint8)
-        data = np.concatenate(
-            [payloads for _, payloads, _ in self._gathered], out=self._scratch[: self._gathered_bytes]
-        )
+        data = np.concatenate([payloads for _, payloads, _ in self._gathered])
         self._gathered, self._gathered_bytes = [], 0
         ends = np.cumsum(lengths)
         starts = ends - lengths
         fits = self._has_head(data, starts, lengths)
         if fits.all():
-            self._decode_lengths(rows, data, starts, ends)
+            self._decode(rows, data, starts, ends)
         else:
             head = data[starts[~fits][0] : ends[~fits][0]][:_HEAD_BYTES].tobytes().hex(" ")
             self._leave_out(f"CDR header {head} is none that ROS 2 writes (00 01)", int((~fits).sum()))
             if fits.any():
-                self._decode_lengths(rows[fits], data, starts[fits], ends[fits])
+                self._decode(rows[fits], data, starts[fits], ends[fits])
 
     def _has_head(self, data: Bytes, starts: _Int64, lengths: _Int64) -> Mask:
         """Return which messages begin like those of the encoding."""
@@ -185,24 +178,6 @@ class TopicTable:
         if self._dialect is CDR and fits.any():
             fits[fits] = gather_integers(data.data, starts[fits], "u2") == _CDR_HEAD
         return fits
-
-    def _decode_lengths(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64) -> None:
-        """Decode messages; many of equal length are decoded together, since each of their fields is a strided view."""
-        lengths = ends - starts
-        if (lengths == lengths[0]).all():
-            self._decode(rows, data, starts, ends)
-            return
-        groups = dict(group_by_key(lengths))
-        for length in [
-            length for length, rows_of_length in groups.items() if length and len(rows_of_length) >= MIN_GROUP
-        ]:
-            group = groups.pop(length)
-            begins = length * np.arange(len(group))
-            alike = _gather_payloads(data.data, starts[group], length)
-            self._decode(rows[group], alike, begins, begins + length)
-        if groups:
-            group = np.sort(np.concatenate(list(groups.values())))
-            self._decode(rows[group], data, starts[group], ends[group])
 
     def _decode(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64) -> None:
         """Decode messages side by side; those that do not fit their definition are counted and left out."""

@@ -24,7 +24,6 @@ from tcpipe.logs.topics import normalize_type_name
 from tcpipe.logs.wire_types import (
     BASE_TYPES,
     MAX_COLUMNS,
-    MAX_FIXED_ELEMENTS,
     Array,
     FieldType,
     FieldTypes,
@@ -33,8 +32,6 @@ from tcpipe.logs.wire_types import (
     Scalar,
     Text,
     WireType,
-    count_fixed_elements,
-    is_boundless,
     make_record,
     parse_msg,
 )
@@ -143,14 +140,6 @@ class TypeLibrary:
         wire = _Unfold(known, fallback, definitions).record(type_name, ())
         if wire.leaves > MAX_COLUMNS:
             raise DefinitionError(f"type {type_name} unfolds to {wire.leaves} columns, more than {MAX_COLUMNS}")
-        elements = count_fixed_elements(wire)
-        if elements > MAX_FIXED_ELEMENTS:
-            what = f"contains {elements} texts or messages in arrays of fixed length, more than {MAX_FIXED_ELEMENTS}"
-            raise DefinitionError(f"type {type_name} {what}")
-        if is_boundless(wire, empty_bytes=0 if ros1 else 1):
-            raise DefinitionError(
-                f"type {type_name} contains an array of messages that take no bytes: nothing bounds its length"
-            )
         return MessageType(wire, source, definitions)
 
     def _known(self, type_name: str, definition: str, schema_encoding: str) -> tuple[_Definitions, Source]:
