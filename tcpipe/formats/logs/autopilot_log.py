@@ -11,7 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -97,26 +97,23 @@ class AutopilotRecords:
     messages: dict[str, AutopilotMessages] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
     damage: dict[Damage, None] = field(default_factory=dict)
-    skipped: dict[str, Damage] = field(default_factory=dict)
-    """By cause, what could not be read."""
     dropouts: int = 0
 
     def add_damage(
         self, cause: str, topic: str | None = None, lost: int | None = None, *, reason: str = "", places: int = 1
     ) -> None:
         """Add damage; more than some thousand entries say nothing new."""
-        if len(self.damage) < MAX_TOPICS:
-            damage = Damage(cause, self.path.name, topic=topic, messages_lost=lost, reason=reason, places=places)
-            self.damage[damage] = None
+        self._note(Damage(cause, self.path.name, topic=topic, messages_lost=lost, reason=reason, places=places))
 
     def skip_to(self, start: int, end: int) -> int:
         """Return ``end``, up to where the file cannot be read from ``start``."""
         cause = "record-damaged" if end < len(self.data) else "file-cut"
-        before = self.skipped.get(cause) or Damage(cause, self.path.name, offset=start, bytes_lost=0, places=0)
-        self.skipped[cause] = replace(
-            before, bytes_lost=(before.bytes_lost or 0) + end - start, places=before.places + 1
-        )
+        self._note(Damage(cause, self.path.name, offset=start, bytes_lost=end - start))
         return end
+
+    def _note(self, damage: Damage) -> None:
+        if len(self.damage) < MAX_TOPICS:
+            self.damage[damage] = None
 
     def add(self, name: str, instance: int, layout: Layout, offsets: Ints, scales: Mapping[str, float]) -> None:
         """Add the messages of an instance; without a time they cannot be used."""
@@ -170,7 +167,6 @@ def read_autopilot_records(path: Path, kind: AutopilotKind) -> AutopilotRecords:
     except OSError as error:
         raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
     _UlogReader(records).read() if kind == "ulog" else _read_dataflash(records)
-    records.damage |= dict.fromkeys(records.skipped.values())
     records.add_damage("no-checksum", lost=0)
     records.sort_by_time()
     return records

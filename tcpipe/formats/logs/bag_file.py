@@ -241,9 +241,6 @@ class BagPart(ChunkedPart[_Chunk]):
     least_bytes = 8
 
     def _open(self) -> dict[int, Topic]:
-        self.outline = ""
-        self.is_unchecked = False
-        """Whether chunks were read that carry no checksum: all but those of bz2."""
         self._connections: dict[int, _Connection] = {}
         self._chunks: list[_Chunk] = []
         try:

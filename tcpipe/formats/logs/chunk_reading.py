@@ -7,7 +7,7 @@ each chunk.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +17,8 @@ import numpy as np
 
 from tcpipe.arrays import Ints, Mask
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_part import Bounds, ByteSource, DamageError, FetchedFile, MessageBlock
-from tcpipe.logs.topics import Damage, Topic
+from tcpipe.formats.logs.log_part import Bounds, ByteSource, DamageError, FetchedFile, LogPart, MessageBlock
+from tcpipe.logs.topics import Topic
 
 GROUP_BYTES = 1 << 23
 """Chunks of about this size together are planned at once."""
@@ -118,15 +118,14 @@ class PlacedChunk(Protocol):
 AnyChunk = TypeVar("AnyChunk", bound=PlacedChunk)
 
 
-class ChunkedPart(ABC, Generic[AnyChunk]):
+class ChunkedPart(LogPart, Generic[AnyChunk]):
     """A file of chunks, open for reading. Methods raise `DamageError` where a chunk is lost."""
 
     least_bytes: int
     """No message's record is shorter."""
 
     def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
-        self.name = name
-        self.damage: list[Damage] = []
+        super().__init__(name)
         self._bytes = ByteSource(path, fetched)
         self._bounds = Bounds(path, self._bytes.size)
         try:
@@ -138,17 +137,6 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
     def close(self) -> None:
         """Close the file."""
         self._bytes.close()
-
-    def _note(
-        self,
-        cause: str,
-        offset: int | None,
-        *,
-        messages_lost: int | None = None,
-        bytes_lost: int | None = None,
-        reason: str = "",
-    ) -> None:
-        self.damage.append(Damage(cause, self.name, offset, None, messages_lost, bytes_lost, reason=reason))
 
     @abstractmethod
     def _open(self) -> dict[int, Topic]:
@@ -262,7 +250,7 @@ class ChunkedPart(ABC, Generic[AnyChunk]):
         """Return messages as blocks, without those whose time is past what 63 bits hold."""
         times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
         if not times.all():
-            self._note("time-invalid", None, messages_lost=int((~times).sum()))
+            self._note("time-invalid", messages_lost=int((~times).sum()))
             messages, ordinal = messages.at(times), ordinal[times]
         return messages.blocks(ordinal)
 

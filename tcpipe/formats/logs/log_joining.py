@@ -84,12 +84,10 @@ class JoinedLog(OpenLog):
     def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
         """Return each topic's table over all files, in log-time order."""
         parts: dict[str, list[pa.Table]] = {}
-        for log in self._logs:
-            for name, table in log.tables([topic for topic in topics if topic in log.topics]).items():
+        for tables in self.batches(topics):
+            for name, table in tables.items():
                 parts.setdefault(name, []).append(table)
-        lent = [topic for topic in topics if not any(topic in log.topics for log in self._logs)]
-        of_earlier = self._earlier.tables(lent) if self._earlier and lent else {}
-        return {name: _join_tables(name, tables) for name, tables in parts.items()} | of_earlier
+        return {name: pa.concat_tables(of_topic).sort_by("log_time_ns") for name, of_topic in parts.items()}
 
     def batches(self, topics: Sequence[str]) -> Iterator[dict[str, pa.Table]]:
         """Yield each topic's tables piece by piece, file after file."""
@@ -102,14 +100,6 @@ class JoinedLog(OpenLog):
         lent = [topic for topic in topics if not any(topic in log.topics for log in self._logs)]
         if self._earlier and lent:
             yield from self._earlier.batches(lent)
-
-
-def _join_tables(topic: str, tables: Sequence[pa.Table]) -> pa.Table:
-    if len(tables) == 1:  # in order already
-        return tables[0]
-    for table in tables[1:]:
-        _require_same_fields(topic, tables[0].schema, table.schema)
-    return pa.concat_tables(tables).sort_by("log_time_ns")
 
 
 def _require_same_fields(topic: str, first: pa.Schema, other: pa.Schema) -> None:

@@ -9,12 +9,12 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -82,32 +82,41 @@ def group_by_key(keys: Ints) -> Iterator[tuple[int, Ints]]:
         yield int(keys[order[start]]), order[start:end]
 
 
-class LogPart(Protocol):
+class LogPart(ABC):
     """One file of a log, open for reading."""
 
-    name: str
     container: str
     """``mcap``, ``bag`` or ``rosbag2``."""
-    damage: list[Damage]
-    """Damage that was found so far; it may have one place twice."""
+    channels: Mapping[int, Topic]
+    """Every source of messages (a connection, channel or topic row) by its number."""
+    outline = ""
+    """A hash (hex) of the file's size and index, which distinguish it from any other log; "" without an index."""
+    is_unchecked = False
+    """Whether no checksum covers some of what was read."""
 
-    @property
-    def channels(self) -> Mapping[int, Topic]:
-        """Return every source of messages (a connection, channel or topic row) by its number."""
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.damage: list[Damage] = []
+        """Damage that was found so far; it may have one place twice."""
 
-    @property
-    def is_unchecked(self) -> bool:
-        """Return whether no checksum covers some of what was read."""
-
-    @property
-    def outline(self) -> str:
-        """A hash (hex) of the file's size and index, which distinguish it from any other log; "" without an index."""
-
+    @abstractmethod
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels; what is broken is noted in ``damage`` and stepped over."""
 
+    @abstractmethod
     def close(self) -> None:
         """Close the file."""
+
+    def _note(
+        self,
+        cause: str,
+        offset: int | None = None,
+        *,
+        messages_lost: int | None = None,
+        bytes_lost: int | None = None,
+        reason: str = "",
+    ) -> None:
+        self.damage.append(Damage(cause, self.name, offset, None, messages_lost, bytes_lost, reason=reason))
 
 
 class FetchedFile:

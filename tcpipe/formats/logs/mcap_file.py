@@ -6,7 +6,6 @@ no checksum covers) is believed only as far as the chunk's own records bear it o
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -68,12 +67,11 @@ class McapPart(ChunkedPart[Chunk]):
         """By channel, how many messages a walk met, the first and the last log time."""
         self._untimed = 0
         self._complete = False
-        self.is_unchecked = False
-        """Whether chunks were read that carry no CRC."""
         try:
             if self._bytes.peek(0, len(MAGIC)) != MAGIC:
                 self._note("record-damaged", 0, messages_lost=0)
             self._contents = read_summary(self._bytes)
+            self.outline = self._contents.outline
             if not self._contents.chunks:
                 self._bytes.whole()
             self._bounds.claim(chunk.size for chunk in self._contents.chunks)
@@ -82,18 +80,13 @@ class McapPart(ChunkedPart[Chunk]):
                 self._note(error.cause, self._bytes.size, reason=error.reason)
             self._bytes.whole()
             self._contents = Contents()
-            if not self._walk(self._contents, len(MAGIC), self._bytes.size):
-                self._distrust_last_index(self._contents)
+            if not self._walk(len(MAGIC), self._bytes.size):
+                self._distrust_last_index()
             self._complete = True
             self._bounds.claim(chunk.size for chunk in self._contents.chunks)
             self._count_messages()
         self._bounds.count(len(self._contents.chunks), len(self._contents.channels))
         return {number: self._topic(number) for number in sorted(self._contents.channels)}
-
-    @property
-    def outline(self) -> str:
-        """A hash of the file's size and summary; "" where it is read without one."""
-        return self._contents.outline
 
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels."""
@@ -180,7 +173,7 @@ class McapPart(ChunkedPart[Chunk]):
 
     def read_indexes(self, chunks: list[Chunk]) -> tuple[tuple[Ints, ...], Sequence[int]]:
         """Return the messages of several chunks by their indexes."""
-        regions: list[memoryview | bytes] = []
+        regions: list[memoryview] = []
         places: list[tuple[int, int, int, int]] = []
         unsound, before = [], 0
         self._bytes.expect([_find_needed_bytes(chunk) for chunk in chunks if chunk.index is not None])
@@ -201,18 +194,12 @@ class McapPart(ChunkedPart[Chunk]):
         right, record, stamps, offsets = index_messages(b"".join(regions), at, ends, channels)
         return (chunk_number[record], channels[record], offsets, stamps), [*unsound, *chunk_number[~right].tolist()]
 
-    def _index_region(self, chunk: Chunk, index: dict[int, int]) -> tuple[memoryview | bytes, list[tuple[int, int]]]:
-        """Return bytes that hold a chunk's message indexes, and of each channel's where it begins in them.
-
-        As a rule they lie together, right behind the chunk.
-        """
-        last = chunk.index_bytes - RECORD_HEAD
+    def _index_region(self, chunk: Chunk, index: dict[int, int]) -> tuple[memoryview, list[tuple[int, int]]]:
+        """Return the bytes of a chunk's message indexes, which follow it, and where each channel's begins in them."""
         places = [(channel, at - chunk.end) for channel, at in index.items()]
-        if all(0 <= at <= last for _, at in places):
-            return self._bytes.read(chunk.end, chunk.index_bytes), places
-        records = [self._index_record(at) for at in index.values()]
-        starts = itertools.accumulate((len(record) for record in records), initial=0)
-        return b"".join(records), list(zip(index, starts, strict=False))
+        if not all(0 <= at <= chunk.index_bytes - RECORD_HEAD for _, at in places):
+            raise DamageError("chunk-index-damaged")
+        return self._bytes.read(chunk.end, chunk.index_bytes), places
 
     def _index_entries(self, offset: int, channel: int) -> Ints:
         """Return a message index as (log time, offset), shape (N, 2)."""
@@ -230,16 +217,16 @@ class McapPart(ChunkedPart[Chunk]):
         listed, self._contents.chunks = self._contents.chunks, []
         position = len(MAGIC)
         for chunk in listed:
-            self._walk(self._contents, position, chunk.offset)
+            self._walk(position, chunk.offset)
             self._contents.chunks.append(chunk)
             position = chunk.end + chunk.index_bytes
-        self._walk(self._contents, position, self._bytes.size)
+        self._walk(position, self._bytes.size)
         self._note_odd_messages()
 
-    def _check_data_section(self, contents: Contents, end: int) -> None:
+    def _check_data_section(self, end: int) -> None:
         """Compare the CRC of all data, if there is one, when messages are outside chunks: nothing else covers these."""
         crc = int.from_bytes(self._bytes.peek(end + RECORD_HEAD, 4), "little")
-        if not crc or not any(chunk.headless for chunk in contents.chunks):
+        if not crc or not any(chunk.headless for chunk in self._contents.chunks):
             return
         found = 0
         for start in range(0, end, _LOOSE_BYTES):
@@ -247,11 +234,11 @@ class McapPart(ChunkedPart[Chunk]):
         if found != crc:
             self._note("chunk-damaged", end)
 
-    def _walk(self, contents: Contents, start: int, end: int) -> bool:
+    def _walk(self, start: int, end: int) -> bool:
         """Step through the records; after a damaged one, search the next chunk. Return whether the end was reached."""
         position = start
         while position + RECORD_HEAD <= end:
-            if (after := self._take_loose_messages(contents, position, end)) > position:
+            if (after := self._take_loose_messages(position, end)) > position:
                 position = after
                 continue
             try:
@@ -259,16 +246,16 @@ class McapPart(ChunkedPart[Chunk]):
                 opcode, length = head[0], int.from_bytes(head[1:9], "little")
                 if opcode in (OP_FOOTER, OP_DATA_END) and length <= FOOTER:
                     if opcode == OP_DATA_END:
-                        self._check_data_section(contents, position)
+                        self._check_data_section(position)
                     return True
                 after = position + RECORD_HEAD + length
-                self._take_record(contents, opcode, position, after, end)
+                self._take_record(opcode, position, after, end)
             except DamageError as error:
-                after = self._stepped_over(contents, position, end, error)
+                after = self._stepped_over(position, end, error)
             position = after
         return False
 
-    def _take_loose_messages(self, contents: Contents, position: int, end: int) -> int:
+    def _take_loose_messages(self, position: int, end: int) -> int:
         """Take messages outside chunks that follow one another as if they were a chunk; return where they end."""
         after = position
         with suppress(DamageError):
@@ -282,20 +269,20 @@ class McapPart(ChunkedPart[Chunk]):
                 after += RECORD_HEAD + length
         size = after - position
         if size:
-            contents.chunks.append(Chunk(position, position, size, "", size, 0, 0, headless=True))
+            self._contents.chunks.append(Chunk(position, position, size, "", size, 0, 0, headless=True))
         return after
 
-    def _stepped_over(self, contents: Contents, position: int, end: int, error: DamageError) -> int:
+    def _stepped_over(self, position: int, end: int, error: DamageError) -> int:
         """Note what cannot be at ``position``; return where the next chunk begins."""
         after = self._next_chunk(position + 1, end)
         self._note(error.cause, position, bytes_lost=after - position, reason=error.reason)
-        self._distrust_last_index(contents)
+        self._distrust_last_index()
         return after
 
-    def _take_record(self, contents: Contents, opcode: int, position: int, after: int, end: int) -> None:
+    def _take_record(self, opcode: int, position: int, after: int, end: int) -> None:
         if opcode == OP_CHUNK:
-            contents.chunks.append(self._parse_chunk(position, after))
-            self._bounds.count(len(contents.chunks), 0)
+            self._contents.chunks.append(self._parse_chunk(position, after))
+            self._bounds.count(len(self._contents.chunks), 0)
         elif opcode == OP_MESSAGE and after <= end:
             self._untimed += 1
         elif not 1 <= opcode <= OP_LAST:
@@ -303,9 +290,9 @@ class McapPart(ChunkedPart[Chunk]):
         elif after > end:
             raise DamageError("file-cut")
         elif opcode in (OP_SCHEMA, OP_CHANNEL):
-            contents.note(opcode, self._bytes.read(position + RECORD_HEAD, after - position - RECORD_HEAD))
-        elif opcode == OP_MESSAGE_INDEX and contents.chunks and not contents.chunks[-1].headless:
-            self._take_message_index(contents, position, after)
+            self._contents.note(opcode, self._bytes.read(position + RECORD_HEAD, after - position - RECORD_HEAD))
+        elif opcode == OP_MESSAGE_INDEX and self._contents.chunks and not self._contents.chunks[-1].headless:
+            self._take_message_index(position, after)
 
     def _parse_chunk(self, position: int, after: int) -> Chunk:
         chunk = parse_chunk_head(self._bytes.peek(position + RECORD_HEAD, CHUNK_HEAD + 4), position)
@@ -318,22 +305,22 @@ class McapPart(ChunkedPart[Chunk]):
             return replace(chunk, data_bytes=self._bytes.size - chunk.data_offset, cut=True)
         return chunk
 
-    def _take_message_index(self, contents: Contents, position: int, after: int) -> None:
+    def _take_message_index(self, position: int, after: int) -> None:
         if after - position < RECORD_HEAD + 6:
             raise DamageError("chunk-index-damaged")
         channel = int.from_bytes(self._bytes.peek(position + RECORD_HEAD, 2), "little")
         self._index_entries(position, channel)
-        chunk = contents.chunks[-1]
+        chunk = self._contents.chunks[-1]
         index_bytes = after - chunk.end
         # Which the chunk takes over: a copy for each entry would cost their square.
         index = {} if chunk.index is None else chunk.index
         index[channel] = position
-        contents.chunks[-1] = replace(chunk, index=index, index_bytes=index_bytes)
+        self._contents.chunks[-1] = replace(chunk, index=index, index_bytes=index_bytes)
 
-    def _distrust_last_index(self, contents: Contents) -> None:
+    def _distrust_last_index(self) -> None:
         """Forget the index of the last chunk: where the file breaks off behind it, some of it may be missing."""
-        if contents.chunks:
-            contents.chunks[-1] = replace(contents.chunks[-1], index=None)
+        if self._contents.chunks:
+            self._contents.chunks[-1] = replace(self._contents.chunks[-1], index=None)
 
     def _next_chunk(self, start: int, end: int) -> int:
         """Return where the next plausible chunk begins: its lengths agree with one another and with the file's."""

@@ -29,6 +29,7 @@ _CHUNK_INDEX_HEAD, _CHUNK_INDEX_MIDDLE, _CHUNK_INDEX_TAIL = (
 )
 _INDEX_HEAD = struct.Struct("<BQHI")
 _CHANNEL_OFFSET = struct.Struct("<HQ")
+_STATISTICS = struct.Struct("<QHIIIIQQI")
 FOOTER = 20
 """Bytes of a footer's content."""
 
@@ -130,15 +131,6 @@ class FieldReader:
         self._position += size
         return bytes(self._content[self._position - size : self._position])
 
-    def pairs(self, size: int) -> dict[int, int]:
-        """Return a map of ``size`` bytes from channel to number."""
-        whole = size - size % 10
-        if self._position + whole > len(self._content):
-            raise DamageError("record-damaged")
-        found = self._content[self._position : self._position + whole]
-        self._position += whole
-        return dict(_CHANNEL_OFFSET.iter_unpack(found))
-
     def text(self) -> str:
         """Return a text; bytes that are no UTF-8 are kept visible, so that different names stay different."""
         return self.blob().decode(errors="backslashreplace")
@@ -188,9 +180,12 @@ def parse_chunk_index(content: bytes | memoryview) -> Chunk:
 
 def parse_statistics(content: bytes | memoryview) -> Statistics:
     """Return the counts of the file."""
-    fields = FieldReader(content)
-    messages, _, _, _, _, chunks, _, _, map_bytes = fields.take("QHIIIIQQI")
-    return Statistics(messages, chunks, fields.pairs(map_bytes))
+    try:
+        messages, _, _, _, _, chunks, _, _, map_bytes = _STATISTICS.unpack_from(content)
+        counts = dict(_CHANNEL_OFFSET.iter_unpack(content[_STATISTICS.size : _STATISTICS.size + map_bytes]))
+    except struct.error:
+        raise DamageError("record-damaged") from None
+    return Statistics(messages, chunks, counts)
 
 
 def index_entries(record: bytes | memoryview, channel: int) -> Ints:

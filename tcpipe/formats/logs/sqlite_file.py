@@ -19,8 +19,8 @@ import numpy as np
 
 from tcpipe.errors import LogError
 from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
-from tcpipe.formats.logs.log_part import MAX_CHANNELS, Bounds, MessageBlock, group_by_key
-from tcpipe.logs.topics import Damage, Topic, normalize_type_name
+from tcpipe.formats.logs.log_part import MAX_CHANNELS, Bounds, LogPart, MessageBlock, group_by_key
+from tcpipe.logs.topics import Topic, normalize_type_name
 
 MAGIC = b"SQLite format 3\0"
 
@@ -39,16 +39,14 @@ _Row = tuple[int, int, int, int, bytes]
 """Row id, topic, log time, publish time, data."""
 
 
-class SqlitePart:
+class SqlitePart(LogPart):
     """One .db3 file, open for reading."""
 
     container = "rosbag2"
+    is_unchecked = True
 
     def __init__(self, path: Path, name: str) -> None:
-        self.name = name
-        self.damage: list[Damage] = []
-        self.outline = ""
-        self.is_unchecked = True
+        super().__init__(name)
         self._opened = ExitStack()
         self._is_cut = False
         try:
@@ -110,7 +108,7 @@ class SqlitePart:
         has_journal = size >= wanted and journal.exists() and journal.stat().st_size > 0
         if size < wanted:
             self._is_cut = True
-            self.damage.append(Damage("file-cut", self.name, size, bytes_lost=wanted - size))
+            self._note("file-cut", size, bytes_lost=wanted - size)
         if has_journal or (self._is_cut and size % page_bytes):
             copy = self._opened.enter_context(make_scratch_directory()) / path.name
             shutil.copyfile(path, copy)
@@ -143,7 +141,7 @@ class SqlitePart:
         channels = {}
         for number, topic, type_name, encoding in rows:
             if not isinstance(number, int):
-                self.damage.append(Damage("record-damaged", self.name))
+                self._note("record-damaged")
                 continue
             schema_encoding, definition = definitions.get(type_name, ("", ""))
             count, first, last = spans.get(number, (0, None, None))
@@ -159,7 +157,7 @@ class SqlitePart:
             )
         if unknown := spans.keys() - channels.keys():
             lost = sum(spans[number][0] for number in unknown)
-            self.damage.append(Damage("channel-undeclared", self.name, messages_lost=lost))
+            self._note("channel-undeclared", messages_lost=lost)
         return channels
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
@@ -193,7 +191,7 @@ class SqlitePart:
                     count, first, last = spans.get(topic, (0, stamp, stamp))
                     spans[topic] = count + 1, min(first, stamp), max(last, stamp)
         if lost:
-            self.damage.append(Damage("record-damaged", self.name, messages_lost=lost))
+            self._note("record-damaged", messages_lost=lost)
         return spans
 
     def _message_columns(self) -> tuple[str, str]:
@@ -224,7 +222,7 @@ class SqlitePart:
             if not broken:
                 return
             reason = broken if row is None else f"after message {low}: {broken}"
-            self.damage.append(Damage("database-damaged", self.name, reason=reason))
+            self._note("database-damaged", reason=reason)
             row = self._first_behind(query, max(int(low), 0))
             if row is None:
                 return
@@ -265,7 +263,7 @@ class SqlitePart:
         except _BROKEN as error:
             found = _describe_error(error)
         if found != "ok" and " value in " not in found:  # a value that is none is the row's own trouble, and counted
-            self.damage.append(Damage("database-damaged", self.name, reason=found.splitlines()[-1]))
+            self._note("database-damaged", reason=found.splitlines()[-1])
 
 
 def _describe_error(error: Exception) -> str:
