@@ -360,11 +360,6 @@ class Smoothing:
         return self.before_s + self.after_s
 
     @property
-    def settles_s(self) -> float:
-        """Time after a stop for which values contain motion before it [s]: a filter's exceeds its equivalent mean's."""
-        return 2.0 * self.before_s
-
-    @property
     def late_s(self) -> float:
         """Delay of the stamp after the middle of that time [s]."""
         return (self.before_s - self.after_s) / 2.0
@@ -394,7 +389,7 @@ class PowerSensorFacts:
     def unsettled_s(self) -> tuple[float, float]:
         """How long after a stop, and before a start, values still contain the power of driving [s]."""
         if self.smoothing is not None:
-            return self.smoothing.settles_s, self.smoothing.after_s
+            return 2.0 * self.smoothing.before_s, self.smoothing.after_s  # a filter settles later than its mean
         delay_s = self.delay_s[0] if self.delay_s else 0.0
         return max(delay_s, 0.0), max(-delay_s, 0.0)
 

@@ -122,7 +122,8 @@ class TopicTable:
         log, publish, ordinal = times
         order = np.lexsort((ordinal, log))
         if (np.diff(order) < 0).any():
-            table = _make_contiguous(table).take(number_column(order))
+            table = table.combine_chunks() if table.nbytes < MAX_CONTIGUOUS_BYTES else table
+            table = table.take(number_column(order))
             log, publish, ordinal = log[order], publish[order], ordinal[order]
         count = len(log) if share >= 1 else int(np.searchsorted(log, log[int(share * (len(log) - 1))], "right"))
         self._hold(table, (log, publish, ordinal), count)
@@ -201,10 +202,6 @@ def _gather_payloads(buffer: memoryview, offsets: _Int64, length: int) -> Bytes:
         return np.zeros(0, np.uint8)
     windows: NDArray[np.void] = np.ndarray((len(buffer) - length + 1,), f"V{length}", buffer, 0, (1,))
     return windows[offsets].view(np.uint8)
-
-
-def _make_contiguous(table: pa.Table) -> pa.Table:
-    return table.combine_chunks() if table.nbytes < MAX_CONTIGUOUS_BYTES else table
 
 
 def find_arrow_type(wire_type: WireType) -> pa.DataType:

@@ -149,41 +149,6 @@ def stamp_ns(fields: dict[bytes, bytes], name: bytes) -> int:
     return seconds * NS + nanoseconds  # type: ignore[no-any-return]
 
 
-def read_indexed_messages(found: Excerpt) -> tuple[Messages, Mask]:
-    """Return the messages of an excerpt, and which of its entries are a message of that connection and time.
-
-    Headers of messages agree but for connection and time, so the first is parsed and the others compared to it.
-    """
-    data, offset, entries = found.data, found.offset, found.entries
-    none = Messages(data, entries.channel, offset, offset, offset, entries.log_time_ns, entries.log_time_ns)
-    if not len(offset):
-        return none, np.zeros(0, np.bool_)
-    room = entries.end - entries.offset
-    length = int(gather_integers(data, offset[:1], "u4")[0])
-    fits = room >= length + 8
-    if not fits[0] or length > MAX_HEADER_BYTES:
-        return none, np.zeros(len(offset), np.bool_)
-    windows: Bytes = np.ndarray((len(data) - length - 7, length + 8), np.uint8, data, 0, (1, 1))
-    heads = windows[np.where(fits, offset, offset[0])]
-    conn_at, time_at = _find_message_fields(heads[0, 4 : length + 4].tobytes())
-    if not conn_at or not time_at:
-        return none, np.zeros(len(offset), np.bool_)
-    varies = np.zeros(length + 8, np.bool_)
-    varies[conn_at : conn_at + 4] = varies[time_at : time_at + 8] = varies[length + 4 :] = True
-    channel = heads[:, conn_at : conn_at + 4].copy().view("<u4")[:, 0].astype(np.int64)
-    times = heads[:, time_at : time_at + 8].copy().view("<u4").astype(np.int64)
-    stamp_ns = times[:, 0] * NS + times[:, 1]
-    payload_bytes = heads[:, length + 4 :].copy().view("<u4")[:, 0].astype(np.int64)
-    true: Mask = (
-        fits
-        & (channel == entries.channel)
-        & (stamp_ns == entries.log_time_ns)
-        & (length + 8 + payload_bytes <= room)
-        & ((heads == heads[0]) | varies).all(axis=1)
-    )
-    return Messages(data, channel, offset, offset + (length + 8), payload_bytes, stamp_ns, stamp_ns), true
-
-
 def _find_message_fields(header: bytes) -> tuple[int, int]:
     """Return the offsets of connection and time in a message record; zeros if its header is not that of a message."""
     try:
@@ -289,8 +254,38 @@ class BagPart(ChunkedPart[_Chunk]):
         return replace(chunk, record=record, size=size)
 
     def read_indexed(self, found: Excerpt) -> tuple[Messages, Mask]:
-        """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
-        return read_indexed_messages(found)
+        """Return the messages of an excerpt, and which of them the chunk holds as its index says.
+
+        Headers of messages agree but for connection and time, so the first is parsed and the others compared to it.
+        """
+        data, offset, entries = found.data, found.offset, found.entries
+        none = Messages(data, entries.channel, offset, offset, offset, entries.log_time_ns, entries.log_time_ns)
+        if not len(offset):
+            return none, np.zeros(0, np.bool_)
+        room = entries.end - entries.offset
+        length = int(gather_integers(data, offset[:1], "u4")[0])
+        fits = room >= length + 8
+        if not fits[0] or length > MAX_HEADER_BYTES:
+            return none, np.zeros(len(offset), np.bool_)
+        windows: Bytes = np.ndarray((len(data) - length - 7, length + 8), np.uint8, data, 0, (1, 1))
+        heads = windows[np.where(fits, offset, offset[0])]
+        conn_at, time_at = _find_message_fields(heads[0, 4 : length + 4].tobytes())
+        if not conn_at or not time_at:
+            return none, np.zeros(len(offset), np.bool_)
+        varies = np.zeros(length + 8, np.bool_)
+        varies[conn_at : conn_at + 4] = varies[time_at : time_at + 8] = varies[length + 4 :] = True
+        channel = heads[:, conn_at : conn_at + 4].copy().view("<u4")[:, 0].astype(np.int64)
+        times = heads[:, time_at : time_at + 8].copy().view("<u4").astype(np.int64)
+        stamp_ns = times[:, 0] * NS + times[:, 1]
+        payload_bytes = heads[:, length + 4 :].copy().view("<u4")[:, 0].astype(np.int64)
+        true: Mask = (
+            fits
+            & (channel == entries.channel)
+            & (stamp_ns == entries.log_time_ns)
+            & (length + 8 + payload_bytes <= room)
+            & ((heads == heads[0]) | varies).all(axis=1)
+        )
+        return Messages(data, channel, offset, offset + (length + 8), payload_bytes, stamp_ns, stamp_ns), true
 
     def read_walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
         """Return the wanted messages of a chunk by its records; what these lack is added to ``damage``."""

@@ -31,8 +31,6 @@ from tcpipe.formats.atomic import write_atomic_directory, write_atomic_file
 from tcpipe.formats.logs.ros_types import load_shipped_definitions
 
 Encoding = Literal["ros1", "cdr"]
-McapCompression = Literal["zstd", "lz4", "none"]
-BagCompression = Literal["lz4", "bz2", "none"]
 
 _CHUNK_BYTES = 1 << 20
 _MISSING_IN_ROSBAGS = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
@@ -58,14 +56,11 @@ class MessageStream:
     """Text of a type that neither rosbags nor `load_shipped_definitions` knows."""
 
 
-def write_mcap(
-    path: Path, streams: Sequence[MessageStream], *, encoding: Encoding = "cdr", compression: McapCompression = "zstd"
-) -> None:
+def write_mcap(path: Path, streams: Sequence[MessageStream], *, encoding: Encoding = "cdr") -> None:
     """Write a log in chunks with CRCs: ROS 2 (cdr), or ROS 1 in MCAP (ros1); streams of a topic share a channel."""
     version = 1 if encoding == "ros1" else 2
-    codec = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
     with write_atomic_file(path) as temporary, temporary.open("wb") as out:
-        writer = McapWriter(out, chunk_size=_CHUNK_BYTES, compression=codec[compression], enable_data_crcs=True)
+        writer = McapWriter(out, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile=f"ros{version}", library="tcpipe")
         channels: dict[str, int] = {}
         for stream in streams:
@@ -80,15 +75,13 @@ def write_mcap(
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def write_bag(path: Path, streams: Sequence[MessageStream], *, compression: BagCompression = "lz4") -> None:
+def write_bag(path: Path, streams: Sequence[MessageStream]) -> None:
     """Write a ROS 1 bag, version 2.0."""
     store = _make_typestore("ros1")
-    formats = {"lz4": BagWriter.CompressionFormat.LZ4, "bz2": BagWriter.CompressionFormat.BZ2}
     with write_atomic_file(path) as temporary:
         temporary.unlink(missing_ok=True)  # rosbags insists on making it
         writer = BagWriter(temporary)
-        if compression != "none":
-            writer.set_compression(formats[compression])
+        writer.set_compression(BagWriter.CompressionFormat.LZ4)
         with writer:
             connections = [
                 writer.add_connection(

@@ -22,9 +22,8 @@ def battery(topic="/battery"):
     return MessageStream(topic, "sensor_msgs/msg/BatteryState", TIMES, columns, constants)
 
 
-@pytest.mark.parametrize("compression", ["lz4", "bz2", "none"])
-def test_every_column_arrives_in_its_field_in_log_order(tmp_path, compression):
-    write_bag(tmp_path / "a.bag", [battery()], compression=compression)
+def test_every_column_arrives_in_its_field_in_log_order(tmp_path):
+    write_bag(tmp_path / "a.bag", [battery()])
     store = get_typestore(Stores.ROS1_NOETIC)
     with BagReader(tmp_path / "a.bag") as reader:
         rows = [(time, store.deserialize_ros1(raw, c.msgtype)) for c, time, raw in reader.messages()]
