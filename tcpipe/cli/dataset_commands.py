@@ -13,6 +13,7 @@ from tcpipe.cli.options import (
     OUTPUT_DIRECTORY,
     SEALED,
     add_options,
+    add_output,
     add_path_or_run,
     json_option,
     msgdef_option,
@@ -25,23 +26,24 @@ from tcpipe.cli.output import (
     print_json,
     print_line,
     print_lines,
-    print_result,
-    resolve_recipe_with_source,
     show_progress,
 )
 from tcpipe.errors import UsageError
 from tcpipe.pipeline.options import AddMapOptions, BuildDatasetOptions
 
 if TYPE_CHECKING:
+    from tcpipe.pipeline.diff import Difference
+    from tcpipe.pipeline.explain import Explained
     from tcpipe.pipeline.export import Exported
+    from tcpipe.pipeline.maps import AddedMap
+    from tcpipe.pipeline.verify import Verified
 
 
 @click.command("add-map")
 @add_options(AddMapOptions)
 @click.argument("strays", nargs=-1, metavar="")
-@json_option
-@quiet_option
-def add_map(options: AddMapOptions, *, strays: tuple[str, ...], as_json: bool, quiet: bool) -> None:
+@add_output("add-map")
+def add_map(options: AddMapOptions, *, strays: tuple[str, ...]) -> AddedMap:
     """Put rasters on one common grid and add them to the store as map NAME; grids, resolutions and CRS may differ.
 
     A raster is a GeoTIFF, JPEG 2000 or ERDAS Imagine file. For a raster of many tiles, give a pattern in quotes,
@@ -51,9 +53,7 @@ def add_map(options: AddMapOptions, *, strays: tuple[str, ...], as_json: bool, q
 
     if strays:
         raise UsageError(f"{strays[0]}: belongs to no option; quote patterns, as in --height 'dem/*.tif'")
-    with show_progress(f"map {options.name}", quiet=quiet):
-        added = run_add_map(options)
-    print_result(added, as_json=as_json)
+    return run_add_map(options)
 
 
 @click.command("build-dataset")
@@ -97,8 +97,7 @@ def report(path: str, *, store: str, no_runs: bool, recipe: str | None) -> None:
     """
     from tcpipe.pipeline.report import report as run
 
-    ruling = resolve_recipe_with_source(recipe)[0]
-    written = run(path, store=store, recipe=ruling, runs=not no_runs)
+    written = run(path, store=store, recipe=recipe, runs=not no_runs)
     for page in written:
         print_line(page.path)
         for line in page.physics:
@@ -113,10 +112,10 @@ def report(path: str, *, store: str, no_runs: bool, recipe: str | None) -> None:
 @click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 @click.option("--topics", multiple=True, metavar="NAME[,NAME]", help="Only these topics; repeatable (default: all).")
 @msgdef_option
-@json_option
+@add_output()
 def export(
-    log: str, out: str, *, names: tuple[str, ...], topics: tuple[str, ...], msgdef: str | None, as_json: bool
-) -> int:
+    log: str, out: str, *, names: tuple[str, ...], topics: tuple[str, ...], message_definitions: Path | None
+) -> Exported:
     """Write topics of LOG to OUT as Parquet, one file per topic, one row per message, columns by dotted field name.
 
     The metadata of the files has the definition of the message. tcpipe does not write topics again that OUT already
@@ -124,72 +123,49 @@ def export(
     """
     import resource
 
+    from tcpipe.formats.finding_lines import describe_finding
     from tcpipe.pipeline.export import export as run
 
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # the file of every topic is open at once
-    exported = run(log, Path(out), topics=(*topics, *names), message_definitions=Path(msgdef) if msgdef else None)
-    if as_json:
-        print_json(exported)
-    else:
-        _print(exported, log, out)
-    return exported.exit_code
-
-
-def _print(exported: Exported, log: str, out: str) -> None:
-    from tcpipe.formats.finding_lines import describe_finding
-
-    if exported.status == "unchanged":
-        count = len(exported.topics)
-        print_line(f"nothing to do: {count} of {count} topics of {log} are in {out} already")
-    else:
-        for topic in exported.topics:
-            print_line(f"{topic.messages:>9} messages  {topic.topic}  {topic.path}")
-        if not exported.topics:
-            print_line(f"nothing to export: {log} has no topics")
+    exported = run(log, Path(out), topics=(*topics, *names), message_definitions=message_definitions)
     for kind, findings in (("damage", exported.damage), ("remark", exported.notes)):
         for finding in findings:
             print_line(f"{kind}: {describe_finding(finding)} [{finding.code}]", err=True)
+    return exported
 
 
 @click.command()
 @click.argument("sample_id", metavar="SAMPLE_ID")
 @click.option("--dataset", default="dataset", type=SEALED, metavar="DIR", help="The dataset that contains the sample.")
 @store_option
-@json_option
-@quiet_option
-def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> None:
+@add_output("explain")
+def explain(sample_id: str, *, dataset: str, store: str) -> Explained:
     """Trace SAMPLE_ID to its log, stamps, messages, masked rows, map and recipe."""
     from tcpipe.pipeline.explain import explain as run
 
-    with show_progress("explain", quiet=quiet):
-        found = run(sample_id, dataset=dataset, store=store)
-    print_result(found, as_json=as_json)
+    return run(sample_id, dataset=dataset, store=store)
 
 
 @click.command()
 @add_path_or_run("path", "[PATH|RUN]", required=False)
-@json_option
-def verify(path: str, *, store: str, as_json: bool) -> int:
+@add_output()
+def verify(path: str, *, store: str) -> Verified:
     """Compare checksums and counts of the dataset, map, model or cost map at PATH, of RUN, or of the whole store.
 
     Exit code 1: a file has changed, is missing or contradicts another.
     """
     from tcpipe.pipeline.verify import verify as run
 
-    found = run(path, store=store)
-    print_result(found, as_json=as_json)
-    return 1 if found.problems else 0
+    return run(path, store=store)
 
 
 @click.command()
 @click.argument("a", type=SEALED, metavar="A")
 @click.argument("b", type=SEALED, metavar="B")
-@json_option
-def diff(a: str, b: str, *, as_json: bool) -> int:
+@add_output()
+def diff(a: str, b: str) -> Difference:
     """List changes from A to B, causes (log, recipe key, map, region, code) and label shifts; exit code 1 if any."""
     from tcpipe.pipeline.diff import diff as run
 
-    found = run(a, b)
-    print_result(found, as_json=as_json)
-    return 0 if found.same else 1
+    return run(a, b)

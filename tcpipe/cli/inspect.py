@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from tcpipe.cli.options import add_path_or_run, json_option, msgdef_option, recipe_option, robot_option
-from tcpipe.cli.output import NEXT_STEP, print_json, print_line, print_lines, resolve_recipe_with_source
+from tcpipe.cli.output import NEXT_STEP, print_json, print_line, print_lines
 
 if TYPE_CHECKING:
     from tcpipe.formats.dataset_card import InspectedDataset
@@ -26,18 +25,14 @@ if TYPE_CHECKING:
 @recipe_option
 @msgdef_option
 @json_option
-def inspect(
-    path: str, *, full: bool, robot: str | None, recipe: str | None, msgdef: str | None, store: str, as_json: bool
-) -> int:
+def inspect(path: str, *, as_json: bool, **how: Any) -> int:
     """List a log's topics, types, rates and roles, with reasons; a map; a dataset; without PATH, the store.
 
     RUN, or RUN/RECIPE, is a run of the store.
     """
     from tcpipe.pipeline.inspect import inspect as run
 
-    ruling, _ = resolve_recipe_with_source(recipe)
-    definitions = Path(msgdef) if msgdef else None
-    found = run(path, recipe=ruling, robot=robot, full=full, message_definitions=definitions, store=store)
+    found = run(path, **how)
     if as_json:
         print_json(found)
     else:

@@ -16,6 +16,7 @@ from tcpipe.cli.options import (
     ONE_OF_SEVERAL,
     OUTPUT_FILE,
     add_options,
+    add_output,
     add_path_or_run,
     complete_runs,
     dry_run_option,
@@ -34,7 +35,6 @@ from tcpipe.cli.output import (
     print_line,
     print_lines,
     print_result,
-    resolve_recipe_with_source,
     show_progress,
 )
 from tcpipe.errors import UsageError
@@ -42,8 +42,13 @@ from tcpipe.formats.atomic import Location
 from tcpipe.pipeline.options import IngestOptions
 
 if TYPE_CHECKING:
+    from tcpipe.pipeline.audit import Audit
     from tcpipe.pipeline.ingest import IngestSummary
+    from tcpipe.pipeline.overlay import Overlay
     from tcpipe.pipeline.plan import IngestResult
+    from tcpipe.pipeline.preflight import Preflight
+    from tcpipe.pipeline.problems import Acknowledged
+    from tcpipe.pipeline.prune import Pruned
 
 
 @click.command()
@@ -243,8 +248,7 @@ def status(
         store, paths = paths[0], paths[1:]
     elif paths and not is_url(store) and not Path(store).exists():
         raise UsageError(f"{paths[0]}: no store here and none at {store}; name one with --store")
-    ruling = resolve_recipe_with_source(recipe)[0]
-    found = run(IngestOptions(paths, store=store, recipe=ruling, robot=robot, min_age=min_age_s))
+    found = run(IngestOptions(paths, store=store, recipe=recipe, robot=robot, min_age=min_age_s))
     if as_json:
         print_json(found)
         return found.exit_code
@@ -259,11 +263,8 @@ def status(
 @robot_option()
 @recipe_option
 @msgdef_option
-@json_option
-@quiet_option
-def preflight(
-    log: str, *, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool
-) -> int:
+@add_output("preflight")
+def preflight(log: str, *, robot: str | None, recipe: str | None, message_definitions: Path | None) -> Preflight:
     """Predict the data of a day from LOG, a typical minute or more, and list what to correct before recording.
 
     Prints segments per hour, the distance breakdown, the uncertainty of labels, the verdict, and findings with
@@ -273,15 +274,7 @@ def preflight(
     """
     from tcpipe.pipeline.preflight import preflight as run
 
-    with show_progress("preflight", quiet=quiet):
-        found = run(
-            log,
-            recipe=resolve_recipe_with_source(recipe)[0],
-            robot=robot,
-            message_definitions=Path(msgdef) if msgdef else None,
-        )
-    print_result(found, as_json=as_json)
-    return found.exit_code
+    return run(log, recipe=recipe, robot=robot, message_definitions=message_definitions)
 
 
 @click.command()
@@ -289,11 +282,8 @@ def preflight(
 @robot_option()
 @recipe_option
 @msgdef_option
-@json_option
-@quiet_option
-def audit(
-    run: str, *, store: str, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool
-) -> int:
+@add_output("audit")
+def audit(run: str, *, store: str, robot: str | None, recipe: str | None, message_definitions: Path | None) -> Audit:
     """Judge the uncertainty of LOG, or of RUN or RUN/RECIPE of the store, by measurements that its track does not use.
 
     tcpipe fuses the run without its fixes in windows of 10, 30 and 60 s and prints the error of the predicted antenna,
@@ -301,23 +291,14 @@ def audit(
     """
     from tcpipe.pipeline.audit import audit as judge
 
-    with show_progress("audit", quiet=quiet):
-        found = judge(
-            run,
-            recipe=resolve_recipe_with_source(recipe)[0],
-            robot=robot,
-            message_definitions=Path(msgdef) if msgdef else None,
-            store=store,
-        )
-    print_result(found, as_json=as_json)
-    return 0
+    return judge(run, recipe=recipe, robot=robot, message_definitions=message_definitions, store=store)
 
 
 @click.command()
 @click.argument("names", nargs=-1, required=True, metavar="RUN|LOG|CALL|DATASET...", shell_complete=complete_runs)
 @store_option
-@json_option
-def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
+@add_output()
+def acknowledge(names: tuple[str, ...], *, store: str) -> Acknowledged:
     """Acknowledge checked problems (damaged or failed logs, runs without segments): tcpipe stops reporting them.
 
     Name a killed call as status prints it; name a waiting log, a damaged document or a dataset by its path.
@@ -327,18 +308,8 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
     This applies to one problem of one content: tcpipe reports other problems, and other content.
     """
     from tcpipe.pipeline.problems import acknowledge as run
-    from tcpipe.tables.findings import find_entry
 
-    result = run(names, store=store)
-    if as_json:
-        print_json(result)
-        return 0
-    for word, problems in (("acknowledged", result.acknowledged), ("acknowledged before", result.before)):
-        for problem in problems:
-            print_line(f"{word}: {problem.name}: {find_entry(problem.finding.code).title} [{problem.finding.code}]")
-    if not result.acknowledged:
-        print_line("nothing to do: these problems are already acknowledged")
-    return 0
+    return run(names, store=store)
 
 
 @click.command()
@@ -347,10 +318,8 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
 @recipe_option
 @click.option("--forget", multiple=True, metavar="OUT", help="Remove what only this deleted dataset needs; repeatable.")
 @click.option("--dry-run", is_flag=True, help="Print what would be removed; change nothing.")
-@json_option
-def prune(
-    *, runs: tuple[str, ...], store: str, recipe: str | None, forget: tuple[str, ...], dry_run: bool, as_json: bool
-) -> int:
+@add_output()
+def prune(*, runs: tuple[str, ...], store: str, recipe: str | None, forget: tuple[str, ...], dry_run: bool) -> Pruned:
     """Remove superseded runs, and those of earlier recipes that the current one replaces; or each RUN or RUN/RECIPE.
 
     tcpipe also removes files of killed calls. It keeps runs that a dataset needs and folders that contain files of
@@ -358,17 +327,15 @@ def prune(
     """
     from tcpipe.pipeline.prune import prune as run
 
-    found = run(runs, store=store, recipe=resolve_recipe_with_source(recipe)[0], forget=forget, dry_run=dry_run)
-    print_result(found, as_json=as_json)
-    return 0
+    return run(runs, store=store, recipe=recipe, forget=forget, dry_run=dry_run)
 
 
 @click.command()
 @click.argument("run", metavar="RUN", shell_complete=complete_runs)
 @click.argument("out", type=OUTPUT_FILE, metavar="OUT.mcap")
 @store_option
-@json_option
-def overlay(run: str, out: str, *, store: str, as_json: bool) -> None:
+@add_output()
+def overlay(run: str, out: str, *, store: str) -> Overlay:
     """Write OUT.mcap from RUN or RUN/RECIPE of the store, on the clock of its log.
 
     OUT contains the fused track, segments with labels, masked sections with reasons, and rejected measurements. Open
@@ -376,4 +343,4 @@ def overlay(run: str, out: str, *, store: str, as_json: bool) -> None:
     """
     from tcpipe.pipeline.overlay import write_overlay as write
 
-    print_result(write(run, Path(out), store=store), as_json=as_json)
+    return write(run, Path(out), store=store)

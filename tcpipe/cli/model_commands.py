@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, add_options, jobs_option, json_option, quiet_option
-from tcpipe.cli.output import print_json, print_lines, print_result, show_progress
+from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, add_options, add_output, jobs_option
 from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions, RouteGraphOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tcpipe.experiment.reproduction import Size
+    from tcpipe.experiment.benchmark import BenchmarkResult
+    from tcpipe.experiment.reproduction import Reproduction, Size
     from tcpipe.formats.maps.map_files import MapFile
+    from tcpipe.learning.evaluation_files import EvaluationResult
     from tcpipe.learning.fitting import ModelKind
     from tcpipe.learning.models import Model
+    from tcpipe.learning.training import TrainResult
+    from tcpipe.planning.cost_map import CostMapResult
+    from tcpipe.planning.drives import DrivesResult
+    from tcpipe.planning.path_files import PathResult, PlanResult
+    from tcpipe.planning.route_graph import RouteGraphResult
 
 
 @click.command()
 @add_options(TrainOptions)
-@json_option
-@quiet_option
-def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:
+@add_output("train")
+def train(options: TrainOptions) -> TrainResult:
     """Train a model on DATASET and write it to the folder OUT.
 
     Without options: the simplest of curves, physics and boosted trees that predicts other runs as well as the best.
@@ -35,16 +39,13 @@ def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:
     """
     from tcpipe.api import run_train
 
-    with show_progress("train", quiet=quiet):
-        result = run_train(options)
-    print_result(result, as_json=as_json)
+    return run_train(options)
 
 
 @click.command()
 @add_options(EvaluateOptions)
-@json_option
-@quiet_option
-def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
+@add_output("evaluate", as_values=True)
+def evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     """Evaluate MODEL on DATASET's test samples and unseen area, and write evaluation.json and .html to OUT.
 
     RMSE and MAPE of power, velocity, time and energy by terrain class; baselines, centred by the same rule; the
@@ -57,12 +58,7 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
     """
     from tcpipe.api import run_evaluate
 
-    with show_progress("evaluate", quiet=quiet):
-        result = run_evaluate(options)
-    if as_json:
-        print_json(result.values)
-    else:
-        print_lines(result)
+    return run_evaluate(options)
 
 
 @click.command()
@@ -74,18 +70,10 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 @click.option("--seeds", default=5, type=click.IntRange(1, 100), help="Trainings of each network.")
 @click.option("--out", default="benchmark", type=OUTPUT_DIRECTORY, help="Where tables, models and evaluations go.")
 @click.option("--predictor", metavar="FILE.py[:NAME]", help="Your own model, which joins the kinds.")
-@json_option
-@quiet_option
+@add_output("benchmark", as_values=True)
 def benchmark(
-    datasets: Sequence[str],
-    *,
-    kinds: Sequence[ModelKind],
-    seeds: int,
-    out: str,
-    predictor: str | None,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+    datasets: Sequence[str], *, kinds: Sequence[ModelKind], seeds: int, out: str, predictor: str | None
+) -> BenchmarkResult:
     """Train and evaluate every kind of model on every DATASET, and print the paper's table of each.
 
     RMSE and MAPE of power, velocity, energy and time by class, with 95 % intervals over runs and trainings; coverage,
@@ -94,12 +82,7 @@ def benchmark(
     """
     from tcpipe.experiment.benchmark import KINDS, run_benchmark
 
-    with show_progress("benchmark", quiet=quiet):
-        result = run_benchmark(datasets, out, kinds=kinds or KINDS, seeds=seeds, predictor=predictor)
-    if as_json:
-        print_json(result.values)
-    else:
-        print_lines(result)
+    return run_benchmark(datasets, out, kinds=kinds or KINDS, seeds=seeds, predictor=predictor)
 
 
 @click.command()
@@ -119,11 +102,8 @@ def benchmark(
     "--baselines/--no-baselines", default=True,
     help="Train networks of each class alone, with all layers and as Wei and Isler, which take most of the time.",
 )  # fmt: skip
-@json_option
-@quiet_option
-def reproduce(
-    directory: str, *, size: Size, quick: bool, seeds: int, jobs: int, baselines: bool, as_json: bool, quiet: bool
-) -> None:
+@add_output("reproduce")
+def reproduce(directory: str, *, size: Size, quick: bool, seeds: int, jobs: int, baselines: bool) -> Reproduction:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and test the claims of the paper.
 
     Runs 'tcpipe benchmark' on it. Takes some two hours a training on two cores, minutes with --size small; an
@@ -132,16 +112,13 @@ def reproduce(
     """
     from tcpipe.experiment.reproduction import reproduce as run
 
-    with show_progress("reproduce", quiet=quiet):
-        result = run(directory, size="quick" if quick else size, seeds=seeds, jobs=jobs, baselines=baselines)
-    print_result(result, as_json=as_json)
+    return run(directory, size="quick" if quick else size, seeds=seeds, jobs=jobs, baselines=baselines)
 
 
 @click.command("predict-path")
 @add_options(PredictPathOptions)
-@json_option
-@quiet_option
-def predict_path(options: PredictPathOptions, *, as_json: bool, quiet: bool) -> int:
+@add_output("predict-path")
+def predict_path(options: PredictPathOptions) -> PathResult:
     """Predict time and energy of a path and of each of its segments of one metre, with intervals.
 
     The command marks and counts path segments that MODEL cannot predict (class, slope or relief outside the training
@@ -149,17 +126,13 @@ def predict_path(options: PredictPathOptions, *, as_json: bool, quiet: bool) -> 
     """
     from tcpipe.api import run_predict_path
 
-    with show_progress("predict-path", quiet=quiet):
-        result = run_predict_path(options)
-    print_result(result, as_json=as_json)
-    return result.exit_code
+    return run_predict_path(options)
 
 
 @click.command("cost-map")
 @add_options(CostMapOptions)
-@json_option
-@quiet_option
-def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
+@add_output("cost-map")
+def cost_map(options: CostMapOptions) -> CostMapResult:
     """Predict power, velocity, and time and energy per metre, along 16 courses in every cell of a map.
 
     Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with one band per course, the reasons where MODEL cannot
@@ -168,15 +141,8 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
     """
     from tcpipe.planning.cost_map import make_cost_map
 
-    with show_progress("cost-map", quiet=quiet) as shown:
-        result = make_cost_map(
-            *_load_inputs(options),
-            options.out,
-            cell_size_m=options.cell_size,
-            origin_deg=options.origin,
-            step=shown.count,
-        )
-    print_result(result, as_json=as_json)
+    inputs = _load_inputs(options)
+    return make_cost_map(*inputs, options.out, cell_size_m=options.cell_size, origin_deg=options.origin)
 
 
 def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[Model, MapFile]:
@@ -190,9 +156,8 @@ def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[Model, Ma
 
 @click.command("plan-path")
 @add_options(PlanPathOptions)
-@json_option
-@quiet_option
-def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
+@add_output("plan-path")
+def plan_path(options: PlanPathOptions) -> PlanResult:
     """Find the path of least energy, time or distance between two points; costs depend on the direction of travel.
 
     Writes GeoJSON to --out, and beside it a nav_msgs/Path (.path.json) and the goal of Nav2's FollowGPSWaypoints
@@ -201,30 +166,19 @@ def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
     """
     from tcpipe.api import run_plan_path
 
-    with show_progress("plan-path", quiet=quiet) as shown:
-        result = run_plan_path(replace(options, on_step=shown.count))
-    print_result(result, as_json=as_json)
-    return result.exit_code
+    return run_plan_path(options)
 
 
 @click.command("route-graph")
 @add_options(RouteGraphOptions)
-@json_option
-@quiet_option
-def route_graph(options: RouteGraphOptions, *, as_json: bool, quiet: bool) -> int:
+@add_output("route-graph")
+def route_graph(options: RouteGraphOptions) -> RouteGraphResult:
     """Write time, energy and their standard deviations into a graph of Nav2's route server, for each directed edge.
 
     Exit code 3: some edges have no cost; they are left out.
     """
     from tcpipe.planning.route_graph import write_route_graph
 
-    with show_progress("route-graph", quiet=quiet):
-        result = write_route_graph(
-            *_load_inputs(options),
-            Path(options.out),
-            graph=Path(options.graph),
-            origin_deg=options.origin,
-            two_way=options.two_way,
-        )
-    print_result(result, as_json=as_json)
-    return result.exit_code
+    out, graph = Path(options.out), Path(options.graph)
+    inputs = _load_inputs(options)
+    return write_route_graph(*inputs, out, graph=graph, origin_deg=options.origin, two_way=options.two_way)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable
-from contextlib import suppress
-from dataclasses import MISSING, fields
+from contextlib import nullcontext, suppress
+from dataclasses import MISSING, fields, replace
 from functools import partial, wraps
 from math import isfinite, nan
 from pathlib import Path
@@ -16,6 +16,7 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
+from tcpipe.cli.output import print_result, show_progress
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats import atomic
 from tcpipe.tables import options
@@ -226,6 +227,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "sealed": {"type": SEALED},
     "input_file": {"type": INPUT_FILE},
     "input_directory": {"type": INPUT_DIRECTORY},
+    "input_path": {"type": INPUT_DIRECTORY, "callback": lambda _, __, value: value and Path(value)},
     "output_file": {"type": OUTPUT_FILE},
     "several": {"type": ONE_OF_SEVERAL},
     "lonlat": {"type": LonLat()},
@@ -320,7 +322,9 @@ def add_path_or_run(name: str, metavar: str, *, required: bool) -> Option:
 recipe_option = make_click_option("recipe", None, options.RECIPE)
 """``--recipe``; without it TCPIPE_RECIPE, the nearest tcpipe.toml upward, or the defaults."""
 
-msgdef_option = make_click_option("msgdef", None, options.MESSAGE_DEFINITIONS)
+msgdef_option = make_click_option(
+    "message_definitions", None, replace(options.MESSAGE_DEFINITIONS, flags=("--msgdef",), kind="input_path")
+)
 """``--msgdef``: definitions of types that a log does not define."""
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
@@ -328,6 +332,27 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 
 quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print no progress on stderr.")
 """``--quiet``: no progress on stderr."""
+
+
+def add_output(progress: str = "", *, as_values: bool = False) -> Option:
+    """Return a decorator for a command that returns its result, which is printed, and whose exit code is the command's.
+
+    The command gets ``--json``, of the result's ``values`` with ``as_values``; with a name for its ``progress`` also
+    ``--quiet``.
+    """
+
+    def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(run)
+        def command(*options: Any, as_json: bool, quiet: bool = False, **values: Any) -> Any:
+            with show_progress(progress, quiet=quiet) if progress else nullcontext():
+                result = run(*options, **values)
+            print_result(result.values if as_values and as_json else result, as_json=as_json)
+            return getattr(result, "exit_code", 0)
+
+        declared: Callable[..., Any] = json_option(quiet_option(command) if progress else command)
+        return declared
+
+    return decorate
 
 
 def robot_option(about: str = "Robot profile.") -> Option:

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     import rich.progress
     from rich.console import Console
 
-    from tcpipe.recipe import Recipe
-
 
 def find_recipe_with_source(explicit: str | None) -> tuple[Path | None, str]:
     """Return the file of the active recipe, None for the defaults, and the recipe's source, for printing."""
@@ -32,14 +30,6 @@ def find_recipe_with_source(explicit: str | None) -> tuple[Path | None, str]:
 
     path = find_recipe(None if explicit is None else Path(explicit), Path.cwd())
     return path, "built-in defaults" if path is None else str(path)
-
-
-def resolve_recipe_with_source(explicit: str | None) -> tuple[Recipe, str]:
-    """Return the recipe that rules here and where it comes from, for printing."""
-    from tcpipe.formats.recipe_toml import load_recipe
-
-    path, source = find_recipe_with_source(explicit)
-    return load_recipe(path), source
 
 
 @contextmanager
@@ -146,14 +136,6 @@ class Progress:
             self._sizes, self._waiting = sizes, sum(sizes.values())
             self._bars.update(self._all, total=len(sizes), said=f"0/{len(sizes)}")
 
-    def count(self, done: int, total: int, stage: str = "") -> None:
-        """Show how many of how many are done: lines come at every tenth."""
-        if self._bars is not None:
-            text = f"{stage} {100 * done // max(total, 1)} %"
-            self._bars.update(self._all, total=total, completed=done, said=text)
-        elif done * 10 // total > (done - 1) * 10 // total:
-            self.line(f"{self._what}: {100 * done // total} %")
-
     def begin_part(self, number: int, total: int, text: str) -> None:
         """Fill the bar to part ``number`` of ``total``; each stage fills half of its rest. Without bars, a line."""
         if self._bars is None:
@@ -164,7 +146,7 @@ class Progress:
             self._bars.update(self._all, total=total, completed=number, said=text)
 
     def step(self, step: Step) -> None:
-        """Show how far a log is; without bars a line at each of its stages."""
+        """Show how far a log or the command is; without bars a line at each stage of a log, or tenth of the command."""
         if self._bars is not None and self._part is not None:
             if self._stages.get("") != step.stage:
                 self._stages[""], self._stage_begun = step.stage, self._bars.tasks[0].completed
@@ -176,10 +158,14 @@ class Progress:
             size = f" {_format_megabytes(step.done)} of {_format_megabytes(step.total)} MB" if step.total else ""
             self._draw(self._bars, f"; {name}: {step.stage}{size}")
         elif self._bars is not None and step.total:
-            self.count(step.done, step.total, step.stage)
-        elif self._bars is None and step.task and self._stages.get(step.task) != step.stage:
-            self._stages[step.task] = step.stage
-            self.line(f"{step.task}: {step.stage}")
+            said = f"{step.stage} {100 * step.done // step.total} %"
+            self._bars.update(self._all, total=step.total, completed=step.done, said=said)
+        elif self._bars is None and (step.task or 10 * step.done >= step.total > 0):
+            name, tenths = step.task or self._what, 10 * step.done // max(step.total, 1)
+            stage = step.stage if step.task else f"{step.stage} {10 * tenths} %"
+            if self._stages.get(name) != stage:
+                self._stages[name] = stage
+                self.line(f"{name}: {stage}")
 
     def end(self, task: str, *, worked: bool) -> None:
         """Count a log that is done; one that needed no work does not count for the rate."""

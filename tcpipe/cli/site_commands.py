@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from tcpipe.cli.options import (
     LOG,
     OUTPUT_DIRECTORY,
+    add_output,
     complete_scenarios,
-    json_option,
     msgdef_option,
     quiet_option,
     robot_option,
     seed_option,
 )
-from tcpipe.cli.output import print_json, print_line, print_lines, show_progress
+from tcpipe.cli.output import print_line, print_lines, show_progress
 from tcpipe.errors import UsageError
+
+if TYPE_CHECKING:
+    from tcpipe.simulation import SimulatedSite
 
 
 @click.command()
@@ -43,7 +47,7 @@ def demo(directory: str, *, seed: int, quiet: bool) -> None:
 )
 @robot_option()
 @msgdef_option
-def init(directory: str, *, source: str | None, robot: str | None, msgdef: str | None) -> None:
+def init(directory: str, *, source: str | None, robot: str | None, message_definitions: Path | None) -> None:
     """Write tcpipe.toml, the recipe: every key with its default and its meaning, commented out.
 
     With --from: what tcpipe finds in PATH (roles, columns, units, power, mounting), with a value of each; what you have
@@ -54,7 +58,7 @@ def init(directory: str, *, source: str | None, robot: str | None, msgdef: str |
     from tcpipe.pipeline.proposals import propose_recipe
 
     path = Path(directory) / FILE_NAME
-    proposed = source and propose_recipe(source, robot=robot, message_definitions=Path(msgdef) if msgdef else None)
+    proposed = source and propose_recipe(source, robot=robot, message_definitions=message_definitions)
     text = proposed.toml() if proposed else format_commented_toml()
     clear_beside(path)
     if path.is_file() and path.read_bytes() == text.encode():
@@ -77,18 +81,9 @@ def init(directory: str, *, source: str | None, robot: str | None, msgdef: str |
     help="demo, hills12, paper, paper_quick, manoeuvres, tiny; see docs/reference/simulation.md.",
 )
 @seed_option
-@json_option
-@quiet_option
-def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) -> None:
+@add_output("simulate")
+def simulate(out: str, *, scenario: str, seed: int) -> SimulatedSite:
     """Write a simulated site to OUT: real .mcap and .bag logs, real GeoTIFFs, and the true values."""
     from tcpipe.simulation import simulate as run
 
-    with show_progress("simulate", quiet=quiet):
-        site = run(Path(out), scenario=scenario, seed=seed)
-    if as_json:
-        print_json(site)
-    else:
-        for path in (*site.logs, *site.rasters.values(), site.region, *site.truths):
-            print_line(str(path))
-        if site.unchanged:
-            print_line(f"nothing to do: {out} already contains the site")
+    return run(Path(out), scenario=scenario, seed=seed)

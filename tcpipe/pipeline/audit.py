@@ -14,7 +14,7 @@ from tcpipe.errors import FusionError, UsageError, clean_lines
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
-from tcpipe.formats.recipe_toml import load_profiles
+from tcpipe.formats.recipe_toml import load_profiles, resolve_recipe
 from tcpipe.fusion.measurements import DOPPLER, FIXES, PAUSE_NS, Positions
 from tcpipe.fusion.signals import compute_seconds, integrate_signal
 from tcpipe.fusion.withheld import (
@@ -203,7 +203,7 @@ def _make_row(score: WithheldScore) -> tuple[str, ...]:
 def audit(
     run: Location,
     *,
-    recipe: Recipe,
+    recipe: Recipe | Location | None = None,
     robot: str | None = None,
     message_definitions: Path | None = None,
     store: Location = "tcpipe-store",
@@ -231,7 +231,7 @@ def audit(
 
 def read_audited(
     run: Location,
-    recipe: Recipe,
+    recipe: Recipe | Location | None,
     *,
     robot: str | None = None,
     message_definitions: Path | None = None,
@@ -243,7 +243,7 @@ def read_audited(
         return stored.streams(), stored.manifest.recipe.fuse
     if is_store(run):
         raise UsageError(f"{run}: is a store; name one of its runs: tcpipe audit RUN --store {run}")
-    path = run if is_url(run) else Path(run)
+    path, recipe = run if is_url(run) else Path(run), resolve_recipe(recipe)
     step("reading")
     with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as log:
         read = find_read_config(recipe, log.topics)

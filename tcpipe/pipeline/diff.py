@@ -56,6 +56,11 @@ class Difference:
     same: bool
     """Whether nothing differs."""
 
+    @property
+    def exit_code(self) -> int:
+        """1 if anything differs."""
+        return 0 if self.same else 1
+
     def __str__(self) -> str:
         """Return causes and effects as plain lines."""
         return clean_lines(_iterate_lines(self))

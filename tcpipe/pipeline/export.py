@@ -13,7 +13,7 @@ from typing import Literal
 import pyarrow as pa
 
 from tcpipe import __version__
-from tcpipe.errors import LogError, StoreError, UsageError
+from tcpipe.errors import LogError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import Location, clear
 from tcpipe.formats.json_files import read_as, write_json
 from tcpipe.formats.logs.log_file import Log
@@ -85,6 +85,16 @@ class Exported:
     notes: tuple[Finding, ...]
     exit_code: int
     """3 where the log had lost something."""
+
+    def __str__(self) -> str:
+        """Return a line for each topic."""
+        count = len(self.topics)
+        lines = [f"{topic.messages:>9} messages  {topic.topic}  {topic.path}" for topic in self.topics]
+        if self.status == "unchanged":
+            lines = [f"nothing to do: {count} of {count} topics of {self.log} are in {self.out} already"]
+        elif not self.topics:
+            lines = [f"nothing to export: {self.log} has no topics"]
+        return clean_lines(lines)
 
 
 def export(

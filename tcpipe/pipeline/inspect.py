@@ -17,6 +17,7 @@ from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.logs.table_folders import find_table_logs, is_log_file, is_table, list_table_files
 from tcpipe.formats.object_storage import format_path, is_presigned, is_url
 from tcpipe.formats.published_outputs import CARDS, fetch_directory_by_range, find_newest
+from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.formats.runs import Counts, LogOrigin, RunFacts
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
@@ -105,7 +106,7 @@ Inspected: TypeAlias = (
 def inspect(
     path: Location,
     *,
-    recipe: Recipe,
+    recipe: Recipe | Location | None = None,
     robot: str | None = None,
     full: bool = False,
     message_definitions: Path | None = None,
@@ -116,6 +117,7 @@ def inspect(
     ``message_definitions`` is a directory of .msg or .idl files for types that a log does not define. `UsageError`,
     `LogError`, `MapError`, `DatasetError`, `StoreError`: the path is something else, or cannot be read.
     """
+    recipe = resolve_recipe(recipe)
     ask = partial(
         _inspect_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions
     )

@@ -21,7 +21,7 @@ from tcpipe.formats.atomic import Location
 from tcpipe.formats.finding_lines import describe_power, format_findings, format_loss, list_verdict
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
-from tcpipe.formats.recipe_toml import load_profiles
+from tcpipe.formats.recipe_toml import load_profiles, resolve_recipe
 from tcpipe.logs.topics import MISSING
 from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.motion.vibration import LEAST_RATE_HZ
@@ -142,7 +142,11 @@ def _rate(topic: RoleTopic) -> str:
 
 
 def preflight(
-    log: Location, *, recipe: Recipe, robot: str | None = None, message_definitions: Path | None = None
+    log: Location,
+    *,
+    recipe: Recipe | Location | None = None,
+    robot: str | None = None,
+    message_definitions: Path | None = None,
 ) -> Preflight:
     """Return what recording like this promises.
 
@@ -150,6 +154,7 @@ def preflight(
     The rest is as `tcpipe.pipeline.ingest.ingest` takes it. `LogError`, `RecipeError`: it is no log, or cannot be read
     at all.
     """
+    recipe = resolve_recipe(recipe)
     robot = robot or recipe.robot
     path = log if is_url(log) else Path(log)
     if isinstance(path, Path) and path.is_dir():

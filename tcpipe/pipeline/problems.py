@@ -6,14 +6,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tcpipe.errors import UsageError, list_first
+from tcpipe.errors import UsageError, clean_lines, list_first
 from tcpipe.formats.atomic import Location, make_scratch_directory
 from tcpipe.formats.documents import State, make_key, make_run_key, read_record
 from tcpipe.formats.runs import Call, Problem, Run, RunFacts, find_problems, make_failure
 from tcpipe.pipeline.calls import ACKNOWLEDGE, BUILD, INGEST, close_call, list_open_calls, record_call
 from tcpipe.pipeline.log_sources import list_log_sources
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Subject, make_finding
+from tcpipe.tables.findings import Subject, find_entry, make_finding
 
 _MOST_CANDIDATES = 10
 
@@ -24,6 +24,17 @@ class Acknowledged:
 
     acknowledged: tuple[Problem, ...]
     before: tuple[Problem, ...]
+
+    def __str__(self) -> str:
+        """Return a line for each problem."""
+        words = [*(("acknowledged", each) for each in self.acknowledged)]
+        words += (("acknowledged before", each) for each in self.before)
+        lines = [
+            f"{word}: {each.name}: {find_entry(each.finding.code).title} [{each.finding.code}]" for word, each in words
+        ]
+        if not self.acknowledged:
+            lines.append("nothing to do: these problems are already acknowledged")
+        return clean_lines(lines)
 
 
 def find_incomplete_runs(state: State, run_id: str | None = None) -> Iterator[Problem]:

@@ -78,6 +78,11 @@ class Verified:
     notes: tuple[str, ...] = omit(())
     """How to repair the problems."""
 
+    @property
+    def exit_code(self) -> int:
+        """1 if anything is wrong."""
+        return 1 if self.problems else 0
+
     def __str__(self) -> str:
         """Return a line of what was read, and one for each problem."""
         read = ", ".join(f"{count} {what}" for what, count in self.read.items()) or "nothing"

@@ -8,7 +8,7 @@ the grid's east. A path of such steps is at most 1 / cos(13.3°) - 1 = 2.8 % lon
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from tcpipe.arrays import Bytes, Floats, Floats32, Ints, Mask
 from tcpipe.errors import MapError
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_model import BATCH, NO_COST, Bits, Reason, SegmentPredictions, iterate_predictions
+from tcpipe.progress import Meter
 from tcpipe.terrain.projection import make_metres_from_plane, parse_crs
 from tcpipe.terrain.sampling import PatchFrames, find_classes_at
 from tcpipe.terrain.target_grid import MapGrid
@@ -230,13 +231,14 @@ class LazyCostGrid:
     predicted: Mask
     frames: CellFrames
 
-    def predict(self, wanted: Mask, step: Callable[[int, int], None]) -> None:
+    def predict(self, wanted: Mask) -> None:
         """Predict the wanted cells that are not predicted yet."""
         todo = list(iterate_blocks(self.source, self.model, self.costs.grid, wanted & ~self.predicted))
         answers = iterate_predictions(self.model, self.source, (self.frames.of(cells) for cells in todo))
-        for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
+        meter = Meter("predicting", len(todo))
+        for cells, found in zip(todo, answers, strict=True):
             self.costs.put(cells, found)
-            step(number, len(todo))
+            meter.add(1)
         self.predicted[wanted] = True
 
     def class_id(self) -> Classes:

@@ -15,13 +15,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from shutil import rmtree
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,13 +53,11 @@ from tcpipe.planning.cost_grid import (
 )
 from tcpipe.planning.cost_model import Reason, check_model, iterate_predictions
 from tcpipe.planning.frames import Frame, make_frame
+from tcpipe.progress import Meter
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
 
 logger = logging.getLogger("tcpipe")
-
-
-Step: TypeAlias = Callable[[int, int], None]
 
 CARD = "cost-map.json"
 KIND = "tcpipe cost map"
@@ -171,7 +168,6 @@ def make_cost_map(
     *,
     cell_size_m: float,
     origin_deg: tuple[float, float] | None = None,
-    step: Step = lambda _, __: None,
 ) -> CostMapResult:
     """Write the cost map of a whole map to ``out``, complete or not at all; an interrupted call resumes.
 
@@ -183,7 +179,6 @@ def make_cost_map(
     cell_size_m : side of a cell in the map's plane [m].
     origin_deg : longitude and latitude of the origin of the Nav2 maps, with true east and north axes; default: the
         plane of the map's CRS.
-    step : called with how many blocks of how many are done.
 
     Raises `ModelError` or `MapError` if the map lacks a layer, is smaller than a cell or cannot be read; `UsageError`
     or `StoreError` if ``out`` is something else or cannot be written, or the origin is far from the map.
@@ -198,7 +193,7 @@ def make_cost_map(
         if found is not None and found.origin_deg == origin_deg:
             return CostMapResult(out, "unchanged", found)
         known = None if found is None else open_cost_map(fetch_directory(out), found)
-        costs = known or _predict_cells(model, source, spool, key, grid, step)
+        costs = known or _predict_cells(model, source, spool, key, grid)
         with publish_directory(out, CARD) as directory:
             scales = _write_files(directory, _Strips(costs, model.errors, read_classes(source, grid)), frame)
             cells, shares = _compute_shares(costs)
@@ -266,12 +261,11 @@ def _claim_spool(out: str) -> Iterator[Path]:
         rmtree(place)
 
 
-def _predict_cells(  # noqa: PLR0917
-    model: Model, source: MapFile, spool: Path, key: str, grid: MapGrid, step: Step
-) -> CostGrid:
+def _predict_cells(model: Model, source: MapFile, spool: Path, key: str, grid: MapGrid) -> CostGrid:
     """Return the costs of all cells; files of ``spool`` keep finished ones, so that an interrupted call resumes."""
     costs, frames = make_empty_grid(grid), CellFrames(grid, where=f"map {source.name}")
     blocks = list(iterate_blocks(source, model, grid))
+    meter = Meter("predicting", len(blocks))
     for other in spool.iterdir():
         if not other.name.startswith(key[:16]):
             other.unlink()
@@ -280,13 +274,13 @@ def _predict_cells(  # noqa: PLR0917
         cells = np.concatenate(here)
         if file.is_file():
             costs.load(cells, read_arrays(file))
+            meter.add(len(here))
         else:
             answers = iterate_predictions(model, source, (frames.of(block) for block in here))
-            for number, (block, found) in enumerate(zip(here, answers, strict=True), first + 1):
+            for block, found in zip(here, answers, strict=True):
                 costs.put(block, found)
-                step(number, len(blocks))
+                meter.add(1)
             write_arrays(file, costs.take(cells))
-        step(first + len(here), len(blocks))
     return costs
 
 

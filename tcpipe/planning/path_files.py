@@ -218,7 +218,6 @@ def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
     found = plan_path(
         make_survey(model, source, options.cell_size if costs is None else costs), start, goal, options.objective,
         allow_extrapolation=options.allow_extrapolation, risk=risk, budget_joule=options.budget,
-        step=options.on_step or (lambda _, __: None),
     )  # fmt: skip
     local = Frame(source, (float(start[0]), float(start[1])))
     nav2_path, nav2_waypoints = (out.with_suffix(f".{name}.json") for name in ("path", "waypoints"))

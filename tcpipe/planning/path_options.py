@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING
 
@@ -81,8 +80,6 @@ class PlanPathOptions:
     speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)
     store: Location = option("tcpipe-store", STORE)
-    on_step: Callable[[int, int], None] | None = None
-    """Called with how many blocks of how many are predicted."""
 
 
 @dataclass(frozen=True, slots=True)

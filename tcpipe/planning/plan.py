@@ -12,7 +12,7 @@ a cell added to its cost. The returned path is the one with the least cost predi
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -107,7 +107,6 @@ def plan_path(
     allow_extrapolation: bool = False,
     risk: float | None = None,
     budget_joule: float | None = None,
-    step: Callable[[int, int], None] = lambda _, __: None,
 ) -> Plan:
     """Return the least-cost path from a point to another.
 
@@ -119,7 +118,6 @@ def plan_path(
     allow_extrapolation : whether to cross ground outside the training range.
     risk : minimise what the path does not exceed with this probability; None: minimise its prediction.
     budget_joule : state the probability that this energy suffices.
-    step : called with how many blocks of how many are predicted.
 
     Raises `PathError` if an end is off the map or on closed ground, or no path connects them; `ModelError` if the model
     states no errors for ``risk`` or a budget.
@@ -131,7 +129,7 @@ def plan_path(
         )
     ends_deg = np.stack([start_deg, goal_deg])
     projection = find_lonlat_projection(survey.source)
-    search = _Search(survey, projection.forward(ends_deg), ends_deg, allow_extrapolation, step)
+    search = _Search(survey, projection.forward(ends_deg), ends_deg, allow_extrapolation)
     search.check_ends()
     search.predict_ground()
     lines, negative = search.find_finalists(objective, None if risk is None else errors)
@@ -175,7 +173,6 @@ class _Search:
     ends_xy_m: Floats
     ends_deg: Floats
     allow_extrapolation: bool
-    step: Callable[[int, int], None]
 
     @property
     def _cells(self) -> Ints:
@@ -231,7 +228,7 @@ class _Search:
                 logger.info(
                     "predicting %d cells, %d courses each; a cost map (tcpipe cost-map) saves that", count, COURSES
                 )
-                survey.predict(ellipse, self.step)
+                survey.predict(ellipse)
             self._check_open()
             paths = self._find("distance")[1]
             if paths and (paths[0].cost * DETOUR <= bound_m * _GRID or ellipse.all()):
@@ -322,7 +319,7 @@ class _Search:
         """Return why there is no path."""
         text = f"no path from start to goal on map {self.survey.source.name}"
         if not self.allow_extrapolation:
-            other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_extrapolation=True, step=self.step)
+            other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_extrapolation=True)
             if other._find("distance")[1]:
                 return f"{text} within the training range of the model; --allow-extrapolation crosses other ground"
         return f"{text}: the ground between them is not traversable or has no data"

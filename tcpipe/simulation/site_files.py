@@ -11,7 +11,7 @@ import numpy as np
 
 from tcpipe import __version__
 from tcpipe.arrays import Floats
-from tcpipe.errors import UsageError
+from tcpipe.errors import UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.json_files import to_json, write_json
 from tcpipe.formats.logs.writing import MessageStream, write_bag, write_mcap, write_rosbag2
@@ -46,6 +46,12 @@ class SimulatedSite:
     truths: tuple[Path, ...]
     world: Path
     unchanged: bool = False  # it was there already
+
+    def __str__(self) -> str:
+        """Return the written files, one a line."""
+        lines = [*self.logs, *self.rasters.values(), self.region, *self.truths]
+        done = [f"nothing to do: {self.directory} already contains the site"] if self.unchanged else []
+        return clean_lines([*map(str, lines), *done])
 
 
 def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> SimulatedSite:

@@ -58,7 +58,7 @@ def _options(name):
 def test_every_option_is_a_keyword_with_the_same_default(name):
     parameters = inspect.signature(getattr(api, FUNCTIONS[name])).parameters
     options = _options(name)
-    assert set(parameters) - {"on_step"} == set(options)
+    assert set(parameters) == set(options)
     for keyword, option in options.items():
         words = {flag.strip("-").replace("-", "_") for flag in option.opts}
         assert keyword in words, "a keyword is a word of the command line"
