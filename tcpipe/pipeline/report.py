@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,6 @@ from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.dataset_files import CARD, read_card, read_intact_card
 from tcpipe.formats.documents import BLOBS, State
-from tcpipe.formats.finding_lines import group_findings
 from tcpipe.formats.integrity import find_broken_seal, seal_page
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.object_storage import is_url
@@ -24,16 +23,15 @@ from tcpipe.formats.runs import Output, RunFacts, find_problems, make_failure
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.plan import list_transient_failures
 from tcpipe.pipeline.problems import is_acknowledged
-from tcpipe.power.witnesses import compare_batteries
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.report.label_sections import describe_physics
 from tcpipe.report.maps import StoredMaps, draw_tracks
 from tcpipe.report.page import is_made_from
 from tcpipe.report.run_report import run_report
-from tcpipe.report.store_report import FailedLog, RunKey, StoredDataset, StoreFacts, store_report
+from tcpipe.report.store_report import RunKey, StoredDataset, StoreFacts, store_report
 from tcpipe.store import Store, find_named_runs, is_path, is_store
-from tcpipe.tables.findings import judge_by_code, read_catalogue_version
+from tcpipe.tables.findings import read_catalogue_version
 
 _FEW_RUNS = 10
 """The page of a store with fewer runs begins with their tracks and the table."""
@@ -98,9 +96,18 @@ def _write_store_page(store: Store, state: State, ruling: Recipe, *, will_be: It
         for row, size in zip(others, sizes, strict=True)
         if size is not None
     }
-    facts, runs = make_store_facts(store, state, ruling, pages | found), store.runs(state)
+    runs = store.runs(state)
+    content = StoreFacts(
+        store,
+        state,
+        ruling=ingest_key(ruling),
+        acknowledged={run.run_id for run in runs if is_acknowledged(find_problems(run.facts), state)},
+        pages=pages | found,
+        datasets=[_describe_dataset(store, output) for output in state.outputs.values() if output.inputs],
+        failed=[*_iterate_failed(state)],
+    )
     tracks = draw_tracks(runs, StoredMaps(store, state.maps)) if len(runs) < _FEW_RUNS else None
-    return _write(store.place, store_report(facts, tracks), ())
+    return _write(store.place, store_report(content, tracks), ())
 
 
 def _name_page(row: RunFacts) -> str:
@@ -158,30 +165,6 @@ def _write(place: Place, html: str, physics: tuple[str, ...]) -> Page:
     return Page(place.where(REPORT), changed, physics)
 
 
-def make_store_facts(store: Store, state: State, ruling: Recipe, pages: Mapping[RunKey, str]) -> StoreFacts:
-    """Return the content of the page of a store; ``pages`` are the names of the pages of runs in the store."""
-    key = ingest_key(ruling)
-    counted = [run.facts for run in store.runs(state)]
-    current = [facts for facts in counted if facts.ingest_key == key]
-    batteries = tuple(compare_batteries((run.run_id, run.robot, run.findings) for run in current))
-    return StoreFacts(
-        where=str(store.root),
-        rows=tuple(row for row in state.list_rows() if row.blob),
-        ruling=key,
-        incomplete=frozenset(
-            (row.run_id, row.recipe_id) for row in state.runs.values() if row.blob and not state.has_payload(row)
-        ),
-        damaged=tuple(map(store.place.where, sorted(state.damaged))),
-        acknowledged=frozenset(row.run_id for row in counted if is_acknowledged(find_problems(row), state)),
-        pages=pages,
-        datasets=tuple(_describe_dataset(store, output) for output in state.outputs.values() if output.inputs),
-        verdict=judge_by_code([*batteries, *(finding for run in current for finding in run.findings)]),
-        changes=batteries,
-        groups=tuple(group_findings((facts.run_id, facts.findings) for facts in current)),
-        failed=tuple(_iterate_failed(state)),
-    )
-
-
 def _describe_dataset(store: Store, output: Output) -> StoredDataset:
     """Return a dataset; the page of the store links to its page if both are on this machine."""
     is_there, page = not _is_replaced(output), Path(output.where) / REPORT
@@ -199,18 +182,16 @@ def _is_replaced(output: Output) -> bool:
         return False
 
 
-def _iterate_failed(state: State) -> Iterator[FailedLog]:
-    """Yield each log that failed and whose content has given no run since."""
+def _iterate_failed(state: State) -> Iterator[tuple[str, str, str]]:
+    """Yield name, state and reason of each log that failed and whose content has given no run since."""
     made = [row.log for row in state.runs.values()]
     contents, names = {log.sha256 for log in made}, {" + ".join(log.paths) for log in made}
     last = {failure.content: failure for failure in sorted(state.failed.values(), key=lambda failure: failure.version)}
     for failure in sorted(last.values(), key=lambda failure: failure.log):
         if failure.content not in contents:
             names.add(name := " + ".join(failure.log))
-            acknowledged = is_acknowledged([make_failure(failure.content, failure.log)], state)
-            yield FailedLog(
-                name, "".join(failure.problems[:1]), "acknowledged" if acknowledged else "failed permanently"
-            )
+            is_known = is_acknowledged([make_failure(failure.content, failure.log)], state)
+            yield name, "acknowledged" if is_known else "failed permanently", "".join(failure.problems[:1])
     for name, why in list_transient_failures([call for _, call in state.calls]).items():
         if name not in names:
-            yield FailedLog(name, why, "failed temporarily")
+            yield name, "failed temporarily", why

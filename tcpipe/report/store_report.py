@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
 from tcpipe.cost.physics import PHYSICS_UNITS
-from tcpipe.formats.finding_lines import FindingGroup, describe_finding
+from tcpipe.formats.documents import State
+from tcpipe.formats.finding_lines import FindingGroup, describe_finding, group_findings
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.runs import RunFacts
+from tcpipe.power.witnesses import compare_batteries
 from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.report.label_sections import make_losses_sections
 from tcpipe.report.page import Link, Number, PageSection, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
-from tcpipe.tables.findings import Finding, Verdict, select_problems
+from tcpipe.store import Store, counts
+from tcpipe.tables.findings import judge_by_code, select_problems
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 RunKey: TypeAlias = tuple[str, str]
@@ -34,6 +37,8 @@ _COLUMNS = (
     *("run", "began (UTC)", "robot", "state", "in datasets", "tags", "segments", "driven [m]", "E [Wh]", "Wh/km"),
     *("used [%]", "noise floor of E [%]", "verdict", "findings"),
 )
+_SHOWN = ("tags", "segments", "driven", "energy", "wh_per_km", "used", "floor", "verdict", "findings")
+"""Values of a run in the last of these columns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,115 +52,88 @@ class StoredDataset:
 
 
 @dataclass(frozen=True, slots=True)
-class FailedLog:
-    """A log without a run: reason and state."""
-
-    log: str
-    why: str
-    state: str
-
-
-@dataclass(frozen=True, slots=True)
 class StoreFacts:
     """The content of a store's page."""
 
-    where: str
-    rows: tuple[RunFacts, ...]
-    """All runs that were not pruned, one for each recipe."""
+    store: Store
+    state: State
     ruling: str
     """Key of the current recipe."""
-    incomplete: frozenset[RunKey]
-    """Runs whose tables are missing."""
-    damaged: tuple[str, ...]
-    """Documents that are not as they were written."""
-    acknowledged: frozenset[str]
+    acknowledged: Collection[str]
     """Runs whose problems a person has acknowledged."""
     pages: Mapping[RunKey, str]
     """Names of the pages of runs in the store."""
-    datasets: tuple[StoredDataset, ...]
-    verdict: Verdict
-    """On the current runs together."""
-    changes: tuple[Finding, ...]
-    """Changes in the latest of them."""
-    groups: tuple[FindingGroup[str], ...]
-    """Findings of the current runs by code, the worst first."""
-    failed: tuple[FailedLog, ...]
+    datasets: Sequence[StoredDataset]
+    failed: Sequence[tuple[str, str, str]]
+    """Name, state and reason of each log without a run."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunRow:
-    """A row of the page: a run under one recipe with its state, page, datasets and codes of findings."""
+    """A run under one recipe, and its values by name for the page's script."""
 
-    state: str
     facts: RunFacts
-    href: str
-    datasets: tuple[int, ...]
-    codes: tuple[int, ...]
-    """Places in `StoreFacts.groups`."""
-    is_current: bool = False
+    is_current: bool
     """Whether it counts: it is of the current recipe, complete, and not superseded."""
-
-    def row(self, terms: Sequence[str]) -> list[Json]:
-        """Return the values of `_FIELDS` for the page's script."""
-        facts = self.facts
-        return [
-            facts.run_id,
-            self.href,
-            None if facts.start_ns is None else facts.start_ns // 10**6,
-            facts.robot,
-            self.state,
-            facts.superseded_by or "",
-            ", ".join(f"{key}={value}" for key, value in facts.tags.items()),
-            facts.segments,
-            round(facts.driven_m, 1),
-            None if facts.energy_joule is None else round(facts.energy_joule / 3600, 2),
-            None if facts.wh_per_km is None else round(facts.wh_per_km, 1),
-            round(100.0 * facts.kept_m / facts.driven_m, 2) if facts.driven_m > 0 else None,
-            round(100.0 * facts.energy_budget.total, 2) if facts.energy_budget else None,
-            facts.verdict.worst,
-            sum(finding.severity != "note" for finding in facts.findings),
-            list(self.datasets),
-            list(self.codes),
-            facts.idle_watt,
-            [facts.physics[term][0] if term in facts.physics else None for term in terms],
-        ]
+    values: Mapping[str, Json]
 
 
-_FIELDS = (
-    *("run", "href", "start_ms", "robot", "state", "superseded_by", "tags", "segments", "driven"),
-    *("energy", "wh_per_km", "used", "floor", "verdict", "findings", "datasets", "codes", "idle", "terms"),
-)
+def sort_runs(content: StoreFacts, groups: Sequence[FindingGroup[str]], terms: Sequence[str]) -> list[RunRow]:
+    """Return a row for each run and recipe, the latest first; then those without a segment.
 
-
-def sort_runs(store: StoreFacts) -> list[RunRow]:
-    """Return a row for each run and recipe, the latest first; then those without a segment."""
+    ``groups``: findings of the current runs by code; ``terms``: of the physics of all runs.
+    """
     members, codes = dict[RunKey, list[int]](), dict[str, list[int]]()
-    for number, dataset in enumerate(store.datasets):
+    for number, dataset in enumerate(content.datasets):
         for part in dataset.runs if dataset.there else ():
             members.setdefault(part, []).append(number)
-    for number, group in enumerate(store.groups):
+    for number, group in enumerate(groups):
         for run_id in group.of:
             codes.setdefault(run_id, []).append(number)
     rows = list[RunRow]()
-    for facts in store.rows:
-        key, why_not = (facts.run_id, facts.recipe_id), _find_why_not_current(facts, store)
-        defect = facts.defect and f"{facts.defect}{', acknowledged' * (facts.run_id in store.acknowledged)}"
-        state = why_not or defect or "current"
-        its_codes = () if why_not else tuple(codes.get(facts.run_id, ()))
-        rows.append(RunRow(state, facts, store.pages.get(key, ""), tuple(members.get(key, ())), its_codes, not why_not))
+    for facts in list_runs(content.state):
+        key, why_not = (facts.run_id, facts.recipe_id), _find_why_not_current(facts, content)
+        defect = facts.defect and f"{facts.defect}{', acknowledged' * (facts.run_id in content.acknowledged)}"
+        values: dict[str, Json] = {
+            "run": facts.run_id,
+            "href": content.pages.get(key, ""),
+            "start_ms": None if facts.start_ns is None else facts.start_ns // 10**6,
+            "robot": facts.robot,
+            "state": why_not or defect or "current",
+            "superseded_by": facts.superseded_by or "",
+            "tags": ", ".join(f"{name}={value}" for name, value in facts.tags.items()),
+            "segments": facts.segments,
+            "driven": round(facts.driven_m, 1),
+            "energy": None if facts.energy_joule is None else round(facts.energy_joule / 3600, 2),
+            "wh_per_km": None if facts.wh_per_km is None else round(facts.wh_per_km, 1),
+            "used": round(100.0 * facts.kept_m / facts.driven_m, 2) if facts.driven_m > 0 else None,
+            "floor": round(100.0 * facts.energy_budget.total, 2) if facts.energy_budget else None,
+            "verdict": facts.verdict.worst,
+            "findings": sum(finding.severity != "note" for finding in facts.findings),
+            "datasets": [*members.get(key, ())],
+            "codes": [] if why_not else [*codes.get(facts.run_id, ())],
+            "idle": facts.idle_watt,
+            "terms": [facts.physics[term][0] if term in facts.physics else None for term in terms],
+        }
+        rows.append(RunRow(facts, not why_not, values))
     rows.sort(key=lambda row: (row.facts.run_id, not row.is_current, row.facts.recipe_id))
     return sorted(rows, key=lambda row: -(row.facts.start_ns or 0))
 
 
-def _find_why_not_current(facts: RunFacts, store: StoreFacts) -> str:
+def list_runs(state: State) -> list[RunFacts]:
+    """Return all runs that were not pruned, one for each recipe."""
+    return [row for row in state.list_rows() if row.blob]
+
+
+def _find_why_not_current(facts: RunFacts, content: StoreFacts) -> str:
     """Return why a run is not part of the sums; "" of one that is."""
     if facts.data_model_version != DATA_MODEL_VERSION:
         return f"of data model {facts.data_model_version}"
-    if (facts.run_id, facts.recipe_id) in store.incomplete:
+    if not content.state.has_payload(facts):
         return _INCOMPLETE
     if facts.superseded_by:
         return "superseded"
-    return _OTHER_RECIPE if facts.ingest_key != store.ruling else ""
+    return _OTHER_RECIPE if facts.ingest_key != content.ruling else ""
 
 
 def name_datasets(datasets: Sequence[StoredDataset]) -> list[str]:
@@ -164,63 +142,73 @@ def name_datasets(datasets: Sequence[StoredDataset]) -> list[str]:
     return [name if short.count(name) == 1 else dataset.out for name, dataset in zip(short, datasets, strict=True)]
 
 
-def store_report(store: StoreFacts, tracks: Plot | None = None) -> str:
+def store_report(content: StoreFacts, tracks: Plot | None = None) -> str:
     """Return the HTML page of a store; with ``tracks`` of few runs on the map, these and the table come first."""
-    runs = sort_runs(store)
-    current = [run for run in runs if run.is_current]
-    groups = [(group, len(current), "runs") for group in store.groups]
-    ledgers = [run.facts.distance_by_reason_m for run in current]
+    every = list_runs(content.state)
+    current = [facts for facts in every if counts(facts, content.state) and facts.ingest_key == content.ruling]
+    groups = group_findings((facts.run_id, facts.findings) for facts in current)
+    terms = sorted({term for facts in every for term in facts.physics if not term.startswith("idle")})
+    runs = sort_runs(content, groups, terms)
+    changes = tuple(compare_batteries((facts.run_id, facts.robot, facts.findings) for facts in current))
+    verdict = judge_by_code([*changes, *(finding for facts in current for finding in facts.findings)])
+    ledgers = [run.facts.distance_by_reason_m for run in runs if run.is_current]
     losses = make_losses_sections(ledgers, "The largest losses of distance and their remedies.", names_runs=True)
-    drift, table = _make_drift_sections(runs), _make_table_section(store, runs)
+    drift, table = _make_drift_sections(runs), _make_table_section(content, runs)
     problem = "The store has no usable runs. 'tcpipe ingest LOG' adds runs; 'tcpipe preflight LOG' checks a log."
-    if any(run.state == _OTHER_RECIPE for run in runs):
+    if any(run.values["state"] == _OTHER_RECIPE for run in runs):
         problem = "The store has no runs of the current recipe. 'tcpipe report --recipe FILE' shows those of another."
     return render_page(
-        title=f"Store {store.where}",
+        title=f"Store {content.store.root}",
         lead="All runs. Sums, trends and losses use the runs of the current recipe and exclude superseded runs.",
-        verdict=show_verdict(store.verdict, store.changes, groups) if current else None,
-        numbers=_make_numbers(store, current),
+        verdict=show_verdict(verdict, changes, [(each, len(current), "runs") for each in groups]) if current else None,
+        numbers=_make_numbers(content, [run.facts for run in runs if run.is_current]),
         warnings=[] if current else [problem],
         sections=[
             *([PageSection("Tracks", plots=[tracks]), *table] if tracks else []),
             *(drift or losses),
             *([] if tracks else table),
             *(losses if drift else []),
-            *_make_datasets_sections(store, runs),
-            *_make_problem_sections(store, runs),
+            *_make_datasets_sections(content, runs),
+            *_make_problem_sections(content, runs),
         ],
         script="store.js" if runs else "",
-        data=_make_data(store, runs),
+        data={
+            "fields": list(runs[0].values) if runs else [],
+            "rows": [[*run.values.values()] for run in runs],
+            "robots": [list(robot) for robot in _list_robots(runs)],
+            "datasets": name_datasets(content.datasets),
+            "codes": [f"{group.severity}: {group.code.replace('-', ' ')}" for group in groups],
+            "terms": [f"{term} [{PHYSICS_UNITS.get(term.partition(' ')[0], '')}]" for term in terms],
+        },
     )
 
 
-def _make_numbers(store: StoreFacts, current: Sequence[RunRow]) -> list[Number]:
-    facts = [run.facts for run in current]
+def _make_numbers(content: StoreFacts, facts: Sequence[RunFacts]) -> list[Number]:
     driven_m, kept_m = (math.fsum(getattr(each, name) for each in facts) for name in ("driven_m", "kept_m"))
     floors = [each.energy_budget.total for each in facts if each.energy_budget]
     return [
-        Number(f"{len(current)}", "runs"),
+        Number(f"{len(facts)}", "runs"),
         Number(f"{sum(run_facts.segments for run_facts in facts)}", "segments"),
         Number(f"{driven_m:.0f} m", "driven"),
         *([Number(f"{100 * kept_m / driven_m:.0f} %", "of the metres used")] if driven_m > 0 else []),
         *([Number(f"{100 * float(np.median(floors)):.1f} %", "noise floor of E, median")] if floors else []),
-        Number(f"{sum(dataset.there for dataset in store.datasets)}", "datasets"),
-        *([Number(f"{len(store.failed)}", "logs without a run")] if store.failed else []),
+        Number(f"{sum(dataset.there for dataset in content.datasets)}", "datasets"),
+        *([Number(f"{len(content.failed)}", "logs without a run")] if content.failed else []),
     ]
 
 
-def _make_table_section(store: StoreFacts, runs: Sequence[RunRow]) -> list[PageSection]:
+def _make_table_section(content: StoreFacts, runs: Sequence[RunRow]) -> list[PageSection]:
     if not runs:
         return []
-    names = name_datasets(store.datasets)
+    names = name_datasets(content.datasets)
     rows = [
         (
-            Link(run.facts.run_id, run.href) if run.href else run.facts.run_id,
+            Link(run.facts.run_id, str(run.values["href"])) if run.values["href"] else run.facts.run_id,
             "" if start_ns is None else f"{datetime.fromtimestamp(start_ns // 10**9, UTC):%Y-%m-%d %H:%M}",
             run.facts.robot,
-            f"superseded by {run.facts.superseded_by}" if run.facts.superseded_by else run.state,
-            ", ".join(names[number] for number in run.datasets),
-            *("" if cell is None else cell for cell in run.row([])[6:15]),
+            f"superseded by {run.facts.superseded_by}" if run.facts.superseded_by else run.values["state"],
+            ", ".join(names[number] for number in cast("list[int]", run.values["datasets"])),
+            *("" if run.values[name] is None else run.values[name] for name in _SHOWN),
         )
         for run in runs[:MOST_ROWS]
         for start_ns in (run.facts.start_ns,)
@@ -282,7 +270,7 @@ def _list_robots(runs: Sequence[RunRow]) -> list[tuple[str, str]]:
     return [(robot, CLASS_COLOURS[n % len(CLASS_COLOURS)]) for n, (robot, _) in enumerate(counts.most_common())]
 
 
-def _make_datasets_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[PageSection]:
+def _make_datasets_sections(content: StoreFacts, runs: Sequence[RunRow]) -> list[PageSection]:
     current_runs = {(run.facts.run_id, run.facts.recipe_id) for run in runs if run.is_current}
     rows = [
         (
@@ -291,7 +279,7 @@ def _make_datasets_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[P
             len(current_runs.difference(dataset.runs)) if dataset.there else "",
             "" if dataset.there else "replaced by another dataset",
         )
-        for dataset in store.datasets[-_MOST_LISTED:]
+        for dataset in content.datasets[-_MOST_LISTED:]
     ]
     header = ("dataset", "runs in it", "runs not in it", "")
     return (
@@ -299,17 +287,17 @@ def _make_datasets_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[P
     )
 
 
-def _make_problem_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[PageSection]:
+def _make_problem_sections(content: StoreFacts, runs: Sequence[RunRow]) -> list[PageSection]:
     """Return the logs without a run, the runs that are damaged or cannot be read, and damaged documents."""
-    rows = [(log.log, log.state, log.why) for log in store.failed]
-    rows += [(document, "damaged", "its bytes have changed since it was written") for document in store.damaged]
+    damaged = map(content.store.place.where, sorted(content.state.damaged))
+    rows = [*content.failed, *((where, "damaged", "its bytes have changed since it was written") for where in damaged)]
     for run in runs:
-        facts = run.facts
+        facts, state = run.facts, str(run.values["state"])
         if run.is_current and facts.defect:
             line = describe_finding((*facts.damage, *select_problems(facts.findings))[0])
-            rows.append((facts.run_id, run.state, line))
-        elif run.state == _INCOMPLETE or facts.data_model_version != DATA_MODEL_VERSION:
-            rows.append((facts.run_id, run.state, "ingest its log again"))
+            rows.append((facts.run_id, state, line))
+        elif state == _INCOMPLETE or facts.data_model_version != DATA_MODEL_VERSION:
+            rows.append((facts.run_id, state, "ingest its log again"))
     if not rows:
         return []
     text = "Use 'tcpipe acknowledge' for problems that cannot be repaired."
@@ -319,15 +307,3 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[RunRow]) -> list[Pa
     return [
         PageSection("Failed, damaged and empty", text, header=header, rows=rows[:_MOST_LISTED], folded=len(rows) > 20)
     ]
-
-
-def _make_data(store: StoreFacts, runs: Sequence[RunRow]) -> Json:
-    terms = sorted({term for run in runs for term in run.facts.physics if not term.startswith("idle")})
-    return {
-        "fields": list(_FIELDS),
-        "rows": [run.row(terms) for run in runs],
-        "robots": [list(robot) for robot in _list_robots(runs)],
-        "datasets": name_datasets(store.datasets),
-        "codes": [f"{group.severity}: {group.code.replace('-', ' ')}" for group in store.groups],
-        "terms": [f"{term} [{PHYSICS_UNITS.get(term.partition(' ')[0], '')}]" for term in terms],
-    }
