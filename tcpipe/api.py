@@ -73,17 +73,12 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     if options.drive:
         from tcpipe.dataset import open_dataset
         from tcpipe.learning.models import load_model
-        from tcpipe.planning.drives import check_origin, evaluate_drives
+        from tcpipe.planning.drives import evaluate_drives
         from tcpipe.planning.path_files import choose_map
 
-        loaded, source, data = (
-            load_model(model, options.predictor),
-            choose_map(store, options.map),
-            open_dataset(dataset),
-        )
+        loaded, source = load_model(model, options.predictor), choose_map(store, options.map)
         logs = [*map(str, options.drive)]
-        check_origin(loaded, data)
-        return evaluate_drives(loaded, data, source, logs, store=store, out=out)
+        return evaluate_drives(loaded, open_dataset(dataset), source, logs, store=store, out=out)
     from tcpipe.learning.evaluation import EvaluateConfig
     from tcpipe.learning.evaluation_files import run_evaluation
     from tcpipe.recipe.checking import from_values

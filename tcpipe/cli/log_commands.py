@@ -21,8 +21,8 @@ from tcpipe.cli.options import (
     complete_runs,
     dry_run_option,
     json_option,
-    min_age_option,
     msgdef_option,
+    parse_duration,
     quiet_option,
     recipe_option,
     robot_option,
@@ -227,7 +227,10 @@ def _print_known(summary: IngestSummary) -> None:
 @store_option
 @recipe_option
 @robot_option("Robot profile, as for ingest.")
-@min_age_option("10m", "A log that was changed more recently than this (90, 90s, 10m, 2h, 1d) counts as growing.")
+@click.option(
+    "--min-age", "min_age_s", default="10m", metavar="T", callback=parse_duration,
+    help="A log that was changed more recently than this (90, 90s, 10m, 2h, 1d) counts as growing.",
+)  # fmt: skip
 @json_option
 def status(
     paths: tuple[str, ...], *, store: str, recipe: str | None, robot: str | None, min_age_s: float, as_json: bool

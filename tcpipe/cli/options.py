@@ -365,11 +365,6 @@ def jobs_option(about: str) -> Option:
     return make_click_option("jobs", 1, options.jobs(about).metadata["option"])
 
 
-def min_age_option(default: str, about: str) -> Option:
-    """Return ``--min-age``."""
-    return click.option("--min-age", "min_age_s", default=default, metavar="T", callback=parse_duration, help=about)
-
-
 seed_option = make_click_option("seed", 1, options.Option("Seed of the simulated site.", kind=options.SEED))
 """``--seed`` of a simulation."""
 

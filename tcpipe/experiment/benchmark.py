@@ -127,7 +127,8 @@ def run_benchmark(
         run_of = _read_runs(dataset)
         for kind in (*kinds, *own_kind):
             own = predictor if kind == "own" else None
-            count, made, tables, times_s = seeds if _is_random(kind) else 1, list[Evaluation](), list[pa.Table](), []
+            is_random = kind == "own" or find_kind(kind).stops_by_fold
+            count, made, tables, times_s = seeds if is_random else 1, list[Evaluation](), list[pa.Table](), []
             for seed in range(count):
                 here = place / name / f"{kind}-{seed}"
                 logger.info("%s: %s, training %d of %d", name, kind, seed + 1, count)
@@ -146,10 +147,6 @@ def run_benchmark(
     lead = "Errors of every kind of model; intervals are of 95 %, over runs and trainings."
     write_text(place / PAGE, render_page(title="Benchmark", lead=lead, numbers=[], sections=sections))
     return BenchmarkResult(place, values, evaluations)
-
-
-def _is_random(kind: ModelKind) -> bool:
-    return kind == "own" or find_kind(kind).stops_by_fold
 
 
 def _train(dataset: Location, here: Path, config: FitConfig, predictor: str | None) -> float:

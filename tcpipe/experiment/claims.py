@@ -66,15 +66,13 @@ def check_claims(runs: Sequence[Sequence[BaselineResult]]) -> list[Claim]:
     found = []
     for split in [split for split in SPLITS if any(row.split == split for row in runs[0])]:
         for baseline, says in CLAIMS.items():
-            rows = [_find_result(run, baseline, split) for run in runs]
-            ratio, between = _combine_ratios([row for row in rows if row is not None], len(runs))
+            wanted = baseline, split, "E"
+            rows = [row for run in runs for row in run if (row.baseline, row.split, row.quantity) == wanted]
+            ratio, between = _combine_ratios(rows, len(runs))
+            of_paper = _PAPER_RATIO[baseline][SPLITS.index(split)] if baseline in _PAPER_RATIO else None
             verdict = _find_verdict(ratio, len(runs))
-            found.append(Claim(says, split, ratio, len(runs), between, _read_paper_value(baseline, split), verdict))
+            found.append(Claim(says, split, ratio, len(runs), between, of_paper, verdict))
     return found
-
-
-def _find_result(run: Sequence[BaselineResult], baseline: str, split: str) -> BaselineResult | None:
-    return next((row for row in run if (row.baseline, row.split, row.quantity) == (baseline, split, "E")), None)
 
 
 def _combine_ratios(rows: Sequence[BaselineResult], seeds: int) -> tuple[Ratio, float | None]:
@@ -107,8 +105,3 @@ def _find_verdict(ratio: Ratio, seeds: int) -> Verdict:
     if ratio.low is None or ratio.high is None or seeds < FEWEST_SEEDS or ratio.low <= 1.0 <= ratio.high:
         return "open"
     return "held" if ratio.high < 1.0 else "NOT held"
-
-
-def _read_paper_value(baseline: str, split: str) -> float | None:
-    """Return the same ratio of the paper's table IV."""
-    return _PAPER_RATIO[baseline][SPLITS.index(split)] if baseline in _PAPER_RATIO else None

@@ -179,7 +179,8 @@ def load_model(path: Location, predictor: str | None = None) -> Model:
         residuals["terrain_class"] = np.nan_to_num(residuals["terrain_class"].astype(np.float64)).astype(np.uint8)
     ground = read_table(place / GROUND)
     ground_deg = np.column_stack([ground.column(name).to_numpy() for name in GROUND_COLUMNS])
-    model = Model(str(path), card, place, compute_card_checksum(card), residuals, ground_deg=ground_deg)
+    checksum = digest(seal_document(card))  # which is of its files, too
+    model = Model(str(path), card, place, checksum, residuals, ground_deg=ground_deg)
     needs_code = find_kind(card.training.kind) is Predictor
     return _add_code(model, predictor) if needs_code or predictor is not None else model
 
@@ -245,8 +246,3 @@ def read_model_card(place: Path) -> ModelCard:
         return parse_typed(found, ModelCard, where)
     except StoreError as error:
         raise ModelError(f"{error.problems[0]}; remove the folder and train the model again") from None
-
-
-def compute_card_checksum(card: ModelCard) -> str:
-    """Return the hash of a card, which is of its files, too."""
-    return digest(seal_document(card))

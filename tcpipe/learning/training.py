@@ -20,7 +20,7 @@ from tcpipe.dataset.tensor import ONE_HOT
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import Location, clear_beside
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.json_files import digest, read_json
+from tcpipe.formats.json_files import convert_record, digest, read_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.published_outputs import find_newest
 from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes
@@ -340,11 +340,8 @@ def _reject_other_files(out: Location) -> None:
 
 
 def _make_result(place: Location, status: str, training: Training, times: TrainingTimes) -> TrainResult:
-    return TrainResult(
-        path=str(place), status=status, model=training.kind, samples=training.samples, epochs=training.epochs,
-        best_epoch=training.best_epoch, held_out_loss=training.held_out_loss,
-        device=training.device, training_times_s=times,
-    )  # fmt: skip
+    named = {"path": str(place), "status": status, "model": training.kind, "training_times_s": times}
+    return convert_record(training, TrainResult, **named)
 
 
 def _make_card(data: Dataset, samples: Samples, fitted: Fitted, key: str, kind: ModelKind) -> ModelCard:

@@ -8,7 +8,7 @@ import resource
 import secrets
 import socket
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -215,12 +215,10 @@ def close_call(store: Store, state: State, killed: OpenCall, message: str) -> No
 def _is_done_by(call: Call, other: Call) -> bool:
     """Return whether another call does all that this one was to do."""
     same = (call.command, call.options) == (other.command, other.options)
-    return same and all(is_below(entry, other.works_on) for entry in call.works_on)
-
-
-def is_below(entry: str, folders: Sequence[str]) -> bool:
-    """Return whether a path or URL is one of those given, or is in one of them."""
-    return any(entry == folder or entry.startswith(f"{folder.rstrip('/')}/") for folder in folders)
+    return same and all(
+        any(entry == folder or entry.startswith(f"{folder.rstrip('/')}/") for folder in other.works_on)
+        for entry in call.works_on
+    )
 
 
 def list_ended_calls(state: State) -> list[Call]:

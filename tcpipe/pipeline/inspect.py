@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -117,10 +116,12 @@ def inspect(
     ``message_definitions`` is a directory of .msg or .idl files for types that a log does not define. `UsageError`,
     `LogError`, `MapError`, `DatasetError`, `StoreError`: the path is something else, or cannot be read.
     """
-    recipe = resolve_recipe(recipe)
-    ask = partial(
-        _inspect_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions
-    )
+    ruling = resolve_recipe(recipe)
+
+    def ask(at: Location) -> InspectedLog:
+        with open_single_log(at, message_definitions=message_definitions, tables=ruling.tables) as log:
+            return replace(inspect_log(log, ruling, robot or ruling.robot, full=full), path=format_path(at))
+
     if is_url(path):
         return _inspect_url(str(path).rstrip("/"), ask)
     if not is_path(path):
@@ -144,7 +145,7 @@ def inspect(
         from tcpipe.formats.maps.map_files import open_map  # noqa: PLC0415  it takes longer to load than a log to inspect
 
         return convert_record(open_map(path).summary(), InspectedMap, path=str(path))
-    return _inspect_logs_or_tables(path, recipe, ask)
+    return _inspect_logs_or_tables(path, ruling, ask)
 
 
 def _inspect_url(url: str, ask: Callable[[Location], InspectedLog]) -> Inspected:
@@ -191,13 +192,6 @@ def _inspect_logs_at(
     if len(logs) == 1:
         return ask(logs[0])
     return InspectedLogs(path=str(path), logs=tuple(_try_inspect(entry, ask) for entry in logs))
-
-
-def _inspect_one(
-    path: Location, *, recipe: Recipe, robot: str | None, full: bool, message_definitions: Path | None
-) -> InspectedLog:
-    with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as log:
-        return replace(inspect_log(log, recipe, robot, full=full), path=format_path(path))
 
 
 def _try_inspect(path: Location, ask: Callable[[Location], InspectedLog]) -> InspectedLog:

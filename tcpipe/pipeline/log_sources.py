@@ -282,28 +282,12 @@ def find_failure(log: str, error: str) -> tuple[Finding, ...]:
     return (make_finding("log-failed", Subject("log", log), names={"error": error}),)
 
 
-_PASSING_SQLITE = {
-    sqlite3.SQLITE_BUSY,
-    sqlite3.SQLITE_LOCKED,
-    sqlite3.SQLITE_NOMEM,
-    sqlite3.SQLITE_READONLY,
-    sqlite3.SQLITE_IOERR,
-    sqlite3.SQLITE_FULL,
-    sqlite3.SQLITE_CANTOPEN,
-    sqlite3.SQLITE_PERM,
-}
-_PRIMARY_CODE = 0xFF
-
-
 def is_transient(error: BaseException) -> bool:
     """Tell whether an error, or what it was raised from, may be gone when the same is tried again."""
-    return any(_is_transient(cause) for cause in _iterate_causes(error))
-
-
-def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
+    causes = [error]
+    while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
+        causes.append(cause)
+    return any(map(_is_transient, causes))
 
 
 def _is_transient(error: BaseException) -> bool:
@@ -311,7 +295,7 @@ def _is_transient(error: BaseException) -> bool:
         return True
     if isinstance(error, OSError):  # decompressors raise it, too, without a number
         return error.errno is not None
-    if isinstance(error, sqlite3.Error):
-        return getattr(error, "sqlite_errorcode", 0) & _PRIMARY_CODE in _PASSING_SQLITE
+    if isinstance(error, sqlite3.OperationalError):  # locked, read-only, full …; of a damaged file a table lacks
+        return getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR) != sqlite3.SQLITE_ERROR
     # The network, credentials; its home loads it when it is needed.
     return type(error).__module__.partition(".")[0] == "obstore"

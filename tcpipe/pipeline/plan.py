@@ -7,7 +7,6 @@ import time
 import traceback
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal, TypeAlias, TypeVar, get_args
 
@@ -214,8 +213,8 @@ class _Known:
     passing: Mapping[str, str]
 
 
-def make_planner(state: State) -> Callable[[IngestTask], PlannedLog]:
-    """Return a function that finds what a log needs, if it is to be ingested now."""
+def plan_ingestion(tasks: Iterable[IngestTask], state: State) -> tuple[PlannedLog, ...]:
+    """Return what each log needs, if it is to be ingested now."""
     made, failures = dict[str, list[RunFacts]](), dict[str, list[LogFailure]]()
     for row in state.runs.values():
         made.setdefault(row.log.sha256, []).append(row)
@@ -223,12 +222,8 @@ def make_planner(state: State) -> Callable[[IngestTask], PlannedLog]:
         failures.setdefault(failure.content, []).append(failure)
     passing = list_transient_failures([call for _, call in state.calls])
     known = _Known(state, state.acknowledged, made, failures, passing)
-    return partial(_decide, known=known, now_ns=time.time_ns())
-
-
-def plan_ingestion(tasks: Iterable[IngestTask], state: State) -> tuple[PlannedLog, ...]:
-    """Return what each log needs."""
-    return tuple(map(make_planner(state), tasks))
+    now_ns = time.time_ns()
+    return tuple(_decide(task, known, now_ns) for task in tasks)
 
 
 def _decide(task: IngestTask, known: _Known, now_ns: int) -> PlannedLog:  # noqa: PLR0911  one for each state

@@ -21,7 +21,7 @@ from tcpipe.formats.published_outputs import find_newest
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Run, RunFacts
 from tcpipe.formats.stored_runs import find_unnamed, list_named_files, list_payload, read_records
-from tcpipe.pipeline.calls import PRUNE, OpenCall, format_bytes, is_alive, list_open_calls, record_call
+from tcpipe.pipeline.calls import PRUNE, format_bytes, is_alive, list_open_calls, record_call
 from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
@@ -96,7 +96,8 @@ def prune(
         if unknown := [name for name in forgotten if name not in first.outputs]:
             raise UsageError(*(f"{name}: is no output of this store; nothing is removed" for name in unknown))
         chosen = _choose_named(opened, first, runs) if runs else _choose_replaced(first, ruling)
-        dead = {open_call.key for open_call in list_open_calls(first) if _is_dead(open_call)}
+        processes = {each.key: each.call.process for each in list_open_calls(first)}
+        dead = {key for key, process in processes.items() if process is not None and is_alive(process) is False}
         removal = _Removal(opened, first, dry_run, forgotten)
         if (waits_for := _find_running(first, dead, mine)) is None:
             removal.give_up(chosen)
@@ -113,10 +114,6 @@ def prune(
         if call is not None:
             call.result = {"counts": {"removed": len(found.removed), "documents": found.documents}}
     return found
-
-
-def _is_dead(call: OpenCall) -> bool:
-    return call.call.process is not None and is_alive(call.call.process) is False
 
 
 def _find_running(state: State, dead: Collection[str], mine: str) -> str | None:

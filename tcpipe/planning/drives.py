@@ -164,16 +164,14 @@ def predict_run(
     return MeasuredRun(run.run_id, metres), reasons
 
 
-def collect_runs(
-    model: Model, source: MapFile, store: Store, logs: Sequence[str], data: Dataset | None = None
-) -> list[MeasuredRun]:
+def collect_runs(model: Model, source: MapFile, store: Store, logs: Sequence[str]) -> list[MeasuredRun]:
     """Return drives' labelled segments on known ground, predicted and measured; `UsageError` for a drive without any.
 
-    They may be of another robot, payload or season, for adaptation of a model. They are moved onto the map by the
-    dataset's recipe (``sample.align``), without one by the default.
+    They may be of another robot, payload or season, for adaptation of a model. They are moved onto the map as the
+    default recipe says (``sample.align``).
     """
     runs = [find_drive(store, log) for log in logs]
-    recipe = replace(Recipe(), read=runs[0].manifest.recipe.read) if data is None else data.card.recipe
+    recipe = replace(Recipe(), read=runs[0].manifest.recipe.read)
     shifts, collected = find_shifts(source, recipe, runs)[0], list[MeasuredRun]()
     for run in runs:
         shift = shifts.get(run.run_id, (0.0, 0.0, 0.0))
@@ -305,8 +303,15 @@ def evaluate_drives(
 
     If the dataset's runs were moved onto their map (``sample.align``), drives are moved, too.
 
-    Raises `ModelError`, `MapError` or `UsageError` if model, map or a drive cannot be used, or ``out`` is a file.
+    Raises `ModelError`, `MapError` or `UsageError` if model, map or a drive cannot be used, ``data`` is not what the
+    model was trained on, so that its training samples are unknown, or ``out`` is a file.
     """
+    trained = model.card.dataset
+    if compute_dataset_checksum(data.card) != trained.sha256:
+        raise ModelError(
+            f"{model.name}: was trained on another dataset ({trained.name}, {trained.sha256[:12]}) than {data.path}; "
+            "expected that one, to find out whether a drive was held back"
+        )
     opened = open_store(store)
     runs = [find_drive(opened, log) for log in logs]
     shifts, moved = find_shifts(source, data.card.recipe, runs)
@@ -327,17 +332,6 @@ def evaluate_drives(
         place.mkdir(parents=True, exist_ok=True)
         write_json(place / JSON, values)
     return DrivesResult(require_card(str(out), [JSON]).place.where(), values)
-
-
-def check_origin(model: Model, data: Dataset) -> None:
-    """Raise `ModelError` if a model was trained on another dataset: then its training samples are unknown."""
-    card = model.card
-    if compute_dataset_checksum(data.card) != card.dataset.sha256:
-        raise ModelError(
-            f"{model.name}: was trained on another dataset ({card.dataset.name}, "
-            f"{card.dataset.sha256[:12]}) than {data.path}; "
-            "expected that one, to find out whether a drive was held back"
-        )
 
 
 def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Finding]:

@@ -14,7 +14,7 @@ from pyproj import Geod
 from tcpipe.arrays import Floats
 from tcpipe.cost.adaptation import Adapted, MeasuredRun, Metres, adapt, predict
 from tcpipe.cost.prediction_errors import COVERAGE, SumDistribution
-from tcpipe.errors import ModelError, PathError, UsageError
+from tcpipe.errors import ModelError, PathError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.geojson import make_line_feature
 from tcpipe.formats.json_files import write_json
@@ -303,12 +303,6 @@ PATH_SEGMENTS = TableSchema(
         Column("reason_names", pa.string(), "", "The same as names, separated by spaces."),
     ),
 )  # fmt: skip
-
-
-def check_ending(path: Path) -> None:
-    """Raise `UsageError` unless a table of path segments can be written to a file of this name."""
-    if path.suffix.lower() not in {".csv", ".geojson"} or path.is_dir():
-        raise UsageError(f"{path}: expected the name of a file that ends in .csv or .geojson")
 
 
 def write_path_segments(path: Path, table: pa.Table) -> None:

@@ -26,7 +26,7 @@ from tcpipe.planning.cost_grid import CostGrid, make_survey
 from tcpipe.planning.cost_map import CARD, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import Reason, check_model
 from tcpipe.planning.frames import Frame, make_frame
-from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cost, write_path_segments
+from tcpipe.planning.path_cost import PathTotals, compute_path_cost, write_path_segments
 from tcpipe.planning.path_options import PlanPathOptions
 from tcpipe.planning.plan import PlanTotals, plan_path
 from tcpipe.store import open_store
@@ -126,7 +126,8 @@ def predict_path(
     ``adapted_by`` is a run by whose labels the model is adapted.
     """
     if out is not None:
-        check_ending(out)
+        if out.suffix.lower() not in {".csv", ".geojson"} or out.is_dir():
+            raise UsageError(f"{out}: expected the name of a file that ends in .csv or .geojson")
         clear_beside(out)
         if out.resolve() == path.resolve():
             raise UsageError(f"{out}: is the file of the path; give the table another name")

@@ -195,7 +195,6 @@ const page = (() => {
     const whole = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array };
     return Object.fromEntries(columns.map(({ name, kind, at: first, bytes, low, step }) => {
       const part = buffer.slice(first, first + bytes);
-      if (kind === "text") return [name, JSON.parse(new TextDecoder().decode(part))];
       if (kind in whole) return [name, new whole[kind](part)];
       const halves = new Uint16Array(part);
       if (kind === "steps") return [name, Float64Array.from(halves, (n) => (n === 65535 ? NaN : low + step * n))];

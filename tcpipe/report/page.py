@@ -10,7 +10,6 @@ kind       what a reader gets
 =========  ======================================================================================
 ``u8``     whole numbers to 255; ``u16`` to 65 535; ``u32`` to 4 294 967 295
 ``f32``    a float32
-``text``   texts, as JSON
 ``half``   the upper 16 bits of a float32, rounded: to 0.4 %, for slopes and deviations
 ``steps``  ``low + step * number`` over the column's range in 65 534 steps, for coordinates and labels
 =========  ======================================================================================
@@ -272,7 +271,7 @@ def _format_breakable(cell: object) -> str:
     return html.escape(str(cell)).replace("/", "/<wbr>").replace("_", "_<wbr>")
 
 
-Kind = Literal["u8", "u16", "u32", "f32", "half", "steps", "text"]
+Kind = Literal["u8", "u16", "u32", "f32", "half", "steps"]
 Column = tuple[Kind, NDArray[np.generic]]
 
 _WHOLE = {"u8": "<u1", "u16": "<u2", "u32": "<u4"}
@@ -302,8 +301,6 @@ def _scale(values: NDArray[np.generic]) -> tuple[float, float]:
 
 
 def _to_bytes(kind: Kind, values: NDArray[np.generic], low: float, step: float) -> bytes:
-    if kind == "text":
-        return json.dumps([clean_line(str(value)) for value in values.tolist()]).encode()
     if kind in _WHOLE:
         return values.astype(_WHOLE[kind]).tobytes()
     if kind == "steps":

@@ -13,7 +13,7 @@ from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.json_files import Json
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.power.rails import is_power_only
-from tcpipe.report.colours import KEPT, LINE_COLOURS, REASON_COLOURS, SEVERITY_COLOURS
+from tcpipe.report.colours import KEPT, LINE_COLOURS, SEVERITY_COLOURS
 from tcpipe.report.page import Column, make_shown_column, pack_columns
 from tcpipe.report.plots import Plot, add_cursor, make_plot, show_text
 from tcpipe.tables.bits import DropReason, flag_name
@@ -446,10 +446,3 @@ def _draw_labels(first: Plot) -> Plot:
     bars = plot.figure.segment("t", "low", "t", "high", color="colour", line_width=1.5, source=empty)
     plot.figure.scatter("t", "y", size=5, color="colour", source=bars.data_source, name="labels")
     return plot
-
-
-def make_reasons_data() -> Json:
-    """Return the gates' bits, names, words and colours as the page's script reads them."""
-    return [
-        [int(bit), flag_name(bit).replace("_", " "), words, REASON_COLOURS[bit]] for bit, words in REASON_WORDS.items()
-    ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -18,7 +18,7 @@ from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import REPORT
 from tcpipe.formats.runs import Run
 from tcpipe.formats.stored_runs import StoredRun, find_stream_files
-from tcpipe.report.colours import DOUBTED, KEPT, SEVERITY_COLOURS, UNUSED
+from tcpipe.report.colours import DOUBTED, KEPT, REASON_COLOURS, SEVERITY_COLOURS, UNUSED
 from tcpipe.report.label_sections import (
     LABELS,
     QUALITY_WORDS,
@@ -40,6 +40,7 @@ from tcpipe.report.page import (
     show_verdict,
 )
 from tcpipe.report.run_plots import (
+    REASON_WORDS,
     SPEED_ROLES,
     FindingSpan,
     Series,
@@ -47,14 +48,13 @@ from tcpipe.report.run_plots import (
     find_finding_spans,
     find_mask_spans,
     make_rail_series,
-    make_reasons_data,
     make_speed_series,
     make_timeline,
     make_trace_lines,
     make_track_series,
     time_plots,
 )
-from tcpipe.tables.bits import Quality
+from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import PhysicsFacts, StageFacts
 from tcpipe.tables.findings import SEVERITIES, Finding, rank_severity, read_catalogue
@@ -75,7 +75,7 @@ def run_report(run: StoredRun, maps: StoredMaps, *, made_from: str = "") -> str:
     track, segments, manifest, rejections = run.track().table, run.segments(), run.manifest, run.rejections()
     label = manifest.info.report.facts.label
     ledger, total = manifest.distance_by_reason_m, manifest.driven_m
-    drive = _draw_run(run, track, segments, rejections=rejections, maps=maps)
+    drive, data, is_complete = _draw_run(run, track, segments, rejections=rejections, maps=maps)
     source = f"from {', '.join(manifest.log.paths)} ({manifest.log.size_bytes / 1e6:.1f} MB)"
     return render_page(
         title=f"Run {run.run_id}",
@@ -90,26 +90,16 @@ def run_report(run: StoredRun, maps: StoredMaps, *, made_from: str = "") -> str:
         ],
         links=[Link("All runs of the store", f"../../{REPORT}")] if run.place.size(REPORT) is not None else [],
         sections=[
-            *drive.sections,
+            *drive,
             *make_losses_sections([ledger], "Kept and excluded distances add up to the odometer.", names_runs=False),
             *_make_label_sections(run, segments, label.physics if label else None),
             _make_sensor_section(manifest, rejections),
             _make_provenance_section(manifest),
         ],
-        script="run.js" if drive.data is not None else "",
-        data=drive.data,
-        made_from=made_from if drive.is_complete else "",
+        script="run.js" if data is not None else "",
+        data=data,
+        made_from=made_from if is_complete else "",
     )
-
-
-@dataclass(frozen=True, slots=True)
-class _Drive:
-    """Map and plots over time, and the data of their script; None of a run without a track."""
-
-    sections: list[PageSection]
-    data: Json
-    is_complete: bool
-    """Whether all maps and streams could be read."""
 
 
 def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
@@ -117,10 +107,13 @@ def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
     return f"{values.mean():.{digits}f} {unit}" if len(values) else "none"
 
 
-def _draw_run(run: StoredRun, track: pa.Table, segments: pa.Table, *, rejections: pa.Table, maps: StoredMaps) -> _Drive:
+def _draw_run(
+    run: StoredRun, track: pa.Table, segments: pa.Table, *, rejections: pa.Table, maps: StoredMaps
+) -> tuple[list[PageSection], Json, bool]:
+    """Return map and plots over time, the data of their script (None: no track), and whether no input was damaged."""
     if not track.num_rows:
         text = "No track: the log has no measurements that can be fused."
-        return _Drive([PageSection("The drive", text)], None, is_complete=True)
+        return [PageSection("The drive", text)], None, True
     info = run.manifest.info
     timeline = make_timeline(track)
     has_datum = info.datum is not None
@@ -152,7 +145,10 @@ def _draw_run(run: StoredRun, track: pa.Table, segments: pa.Table, *, rejections
         ],
         "severities": [[name, SEVERITY_COLOURS[name]] for name in SEVERITIES],
         "starts": [str(stamp) for stamp in to_integers(segments, "start_ns").tolist()],
-        "reasons": make_reasons_data(),
+        "reasons": [
+            [int(bit), flag_name(bit).replace("_", " "), words, REASON_COLOURS[bit]]
+            for bit, words in REASON_WORDS.items()
+        ],
         "quality": [[int(bit), words] for bit, words in QUALITY_WORDS.items()],
         "flags": find_distinguishing_bits(to_integers(segments, "quality")),
         "ground": list(run_map.ground),
@@ -169,7 +165,7 @@ def _draw_run(run: StoredRun, track: pa.Table, segments: pa.Table, *, rejections
         "The drive", " ".join([text, *run_map.missing]), controls="run.html", plots=[run_map.plot, first], stacked=True
     )
     over_time_section = PageSection("Over time", " ".join(over), controls="run_time.html", plots=others, stacked=True)
-    return _Drive([drive, over_time_section], data, is_complete=run_map.is_complete and not lost)
+    return [drive, over_time_section], data, run_map.is_complete and not lost
 
 
 def _read_series(run: StoredRun, timeline: Timeline) -> tuple[list[Series], list[str]]:

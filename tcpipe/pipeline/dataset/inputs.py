@@ -35,7 +35,6 @@ from tcpipe.formats.geojson import regions_to_json
 from tcpipe.formats.integrity import compute_checksums
 from tcpipe.formats.json_files import convert_record, digest
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.published_outputs import FetchedShards
 from tcpipe.formats.runs import RunFacts, StoredMap
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.dataset.options import BuildOptions
@@ -58,13 +57,16 @@ class ChosenInputs:
     map_records: tuple[StoredMap, ...]
     maps: MapPlaces
     made_from: DatasetInputs
-    digest: str
-    """Digest of ``made_from``."""
     again: Mapping[str, Mask]
     """By run: segments that another run has too."""
     chosen: SelectedRuns
     findings: tuple[Finding, ...]
     """On the choice of runs."""
+
+    @property
+    def digest(self) -> str:
+        """Digest of ``made_from``."""
+        return self.made_from.digest
 
     @property
     def map_names(self) -> tuple[str, ...]:
@@ -87,14 +89,14 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> ChosenIn
     if problems:
         raise DatasetError(*problems)
     made_from = _describe_inputs(options, chosen.runs, records)
-    once = remove_duplicates(chosen.runs)
-    maps = partial(_find_maps, store, records)
-    findings = (*chosen.findings, *once.findings)
+    runs, again, of_drives = remove_duplicates(chosen.runs)
+    maps = partial(map, store.map_at, records)
+    findings = (*chosen.findings, *of_drives)
     if not records and not options.without_patches:
         remedy = Remedy("add_map", command="tcpipe add-map NAME --height FILE")
         findings += (make_finding("no-map", Subject("dataset", options.recipe.dataset.name), remedies=[remedy]),)
-    sources = tuple(map(_make_source, once.runs))
-    return ChosenInputs(once.runs, sources, records, maps, made_from, made_from.digest, once.again, chosen, findings)
+    sources = tuple(map(_make_source, runs))
+    return ChosenInputs(runs, sources, records, maps, made_from, again, chosen, findings)
 
 
 def plan_inputs(store: Store, options: BuildOptions, state: State) -> DatasetInputs:
@@ -142,10 +144,6 @@ def _refuse_without_segments(runs: Sequence[StoredRun]) -> None:
         f"{len(runs)} runs, but no segment in them: {where or 'the robot did not move'} "
         "('tcpipe status' lists remedies)"
     )
-
-
-def _find_maps(store: Store, maps: Sequence[StoredMap]) -> tuple[tuple[Path, FetchedShards | None], ...]:
-    return tuple(map(store.map_at, maps))
 
 
 def prove_maps(store: Store, maps: Sequence[StoredMap]) -> None:
@@ -264,15 +262,6 @@ _WAYS = 64  # most runs whose positions are in memory
 
 
 @dataclass(frozen=True, slots=True)
-class UniqueRuns:
-    """Runs with each drive only once: ``again`` marks, by run, the segments that an earlier run also has."""
-
-    runs: tuple[StoredRun, ...]
-    again: Mapping[str, Mask]
-    findings: tuple[Finding, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class _SegmentPositions:
     """Times and places of a run's segments, in the order of its file (time): [ns], (N,), and lon, lat [deg], (N, 2)."""
 
@@ -281,10 +270,12 @@ class _SegmentPositions:
     lonlat_deg: Floats
 
 
-def remove_duplicates(runs: Sequence[StoredRun]) -> UniqueRuns:
-    """Return the runs, by id, without second logs of a drive, and findings; of two, the first by id stays.
+def remove_duplicates(
+    runs: Sequence[StoredRun],
+) -> tuple[tuple[StoredRun, ...], dict[str, Mask], tuple[Finding, ...]]:
+    """Return the runs, by id, without second logs of a drive; of two, the first by id stays.
 
-    ``runs`` are all of one recipe.
+    Also, by run, marks of the segments that an earlier run has, too; and findings. ``runs`` are all of one recipe.
     """
     runs = sorted(runs, key=lambda run: (run.run_id, run.recipe_id))
     start_ns, end_ns = np.array([_find_span_ns(run.facts) for run in runs], np.int64).reshape(-1, 2).T
@@ -325,7 +316,7 @@ def remove_duplicates(runs: Sequence[StoredRun]) -> UniqueRuns:
             continue
         again[run.run_id] = twice
         kept[index] = run
-    return UniqueRuns(tuple(kept.values()), again, tuple(findings))
+    return tuple(kept.values()), again, tuple(findings)
 
 
 def _find_twice(run: StoredRun, duplicates: int, others: Sequence[str]) -> Finding:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,7 +48,7 @@ _PLACING = ("map_index", "position_std_m", "footprint_xy_m", "footprint_lonlat_d
 _HELD_MAPS = 2
 """Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""
 
-MapPlaces = Callable[[], tuple[tuple[Path, FetchedShards | None], ...]]
+MapPlaces = Callable[[], Iterable[tuple[Path, FetchedShards | None]]]
 """Returns arguments of `open_map` on any machine, in order of priority; picklable."""
 
 

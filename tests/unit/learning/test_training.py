@@ -204,7 +204,6 @@ def test_a_damaged_one_is_told_or_as_it_was(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("state") / "model.checkpoint"
     state, again = _make_state(), _make_state()
     state.progress = network_model.TrainingProgress(1, 0, float("inf"), [(1, 0.5, float("nan"))])
-    state.keep(path)
     state.write(path)
     raw = bytearray(path.read_bytes())
     at = data.draw(st.integers(0, len(raw) - 1))
