@@ -23,7 +23,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
-from tcpipe.report.page import Number, PageSection, render_page
+from tcpipe.report.page import PageSection, render_page
 from tcpipe.simulation import SimulatedSite, find_scenario, simulate
 
 logger = logging.getLogger("tcpipe")
@@ -184,8 +184,8 @@ def _render_page(values: ReproductionSummary, runs: Sequence[Evaluation]) -> str
         title="The paper's experiment on a simulated site",
         lead="All tables of a training are in dataset/KIND-SEED/evaluation/evaluation.html.",
         numbers=[
-            *(Number(f"{count} of {len(claims)}", f"claims {name}") for name, count in _count_verdicts(claims).items()),
-            Number(f"{len(runs)}", "training" if len(runs) == 1 else "trainings"),
+            *((f"{count} of {len(claims)}", f"claims {name}") for name, count in _count_verdicts(claims).items()),
+            (f"{len(runs)}", "training" if len(runs) == 1 else "trainings"),
         ],
         warnings=[SIMULATED, *([values.plan.warning] if values.plan.warning else [])],
         sections=[_make_claims_section(claims, " ".join(audits)), *tables],

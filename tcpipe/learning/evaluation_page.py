@@ -18,7 +18,7 @@ from tcpipe.learning.metrics import ALL, LEAST, UNITS, Errors
 from tcpipe.learning.predictions import compute_cost_errors, find_main_cost, find_worst_rows, make_column_name
 from tcpipe.learning.predictor import find_kind
 from tcpipe.report.colours import FAINT, choose_class_colours
-from tcpipe.report.page import Number, PageSection, Shaded, render_page, show_verdict
+from tcpipe.report.page import PageSection, Shaded, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot, show_text
 from tcpipe.tables.columns import to_floats, to_texts
 from tcpipe.tables.findings import judge_again, read_threshold
@@ -57,7 +57,7 @@ def render_evaluation_page(found: Evaluation, table: pa.Table) -> str:
         title=f"Evaluation on {name}",
         lead=f"Model {Path(found.model.name).name} on dataset {name}: errors of {costs}{note}.",
         numbers=[
-            Number(
+            (
                 f"{found.splits[split].errors[quantity][ALL].mape_percent or float('nan'):.2f} %",
                 f"MAPE of {quantity}, {split}",
             )

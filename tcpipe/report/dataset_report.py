@@ -35,7 +35,6 @@ from tcpipe.report.maps import draw_dataset_map
 from tcpipe.report.page import (
     Column,
     Link,
-    Number,
     PageSection,
     make_shown_column,
     pack_columns,
@@ -123,14 +122,14 @@ _SELECTION = PageSection(
 )
 
 
-def _make_numbers(card: DatasetCard) -> list[Number]:
+def _make_numbers(card: DatasetCard) -> list[tuple[str, str]]:
     return [
-        Number(f"{card.samples}", "samples"),
-        *(Number(f"{card.splits[split]}", split) for split in SPLIT_COLOURS),
-        Number(f"{len(card.runs)}", "runs"),
-        Number(f"{sum(card.distance_by_reason_m.values()):.0f} m", "driven"),
-        Number(f"{100 * card.flagged_samples.share:.1f} %", "flagged samples"),
-        *(Number("none", name) for name in card.absent_labels),
+        (f"{card.samples}", "samples"),
+        *((f"{card.splits[split]}", split) for split in SPLIT_COLOURS),
+        (f"{len(card.runs)}", "runs"),
+        (f"{sum(card.distance_by_reason_m.values()):.0f} m", "driven"),
+        (f"{100 * card.flagged_samples.share:.1f} %", "flagged samples"),
+        *(("none", name) for name in card.absent_labels),
     ]
 
 

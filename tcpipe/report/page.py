@@ -69,14 +69,6 @@ _SCRIPTS = "<!-- scripts -->"
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
-    """One headline figure."""
-
-    value: str
-    label: str
-
-
-@dataclass(frozen=True, slots=True)
 class Link:
     """Another page: text and relative path, not yet quoted."""
 
@@ -185,7 +177,7 @@ def render_page(
     *,
     title: str,
     lead: str,
-    numbers: Sequence[Number],
+    numbers: Sequence[tuple[str, str]],
     sections: Sequence[PageSection],
     verdict: VerdictBox | None = None,
     warnings: Sequence[str] = (),
@@ -198,7 +190,7 @@ def render_page(
 
     Parameters
     ----------
-    title, lead, verdict, numbers, warnings : the top of the page, in this order.
+    title, lead, verdict, numbers, warnings : the top of the page, in this order; a number is a value and its label.
     sections : in the order of the page; the first is next to the verdict, the titles form the table of contents.
     links : pages that belong to it.
     script, data : file beside this one that runs when all figures are drawn, and its data.

@@ -6,7 +6,6 @@ import base64
 import io
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from pyproj import Transformer
 
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import PatchFiles, find_places_in_files, open_patches
+from tcpipe.formats.dataset_files import find_places_in_files, open_patches
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.maps.map_files import PICTURE_PX, MapFile
 from tcpipe.report.colours import choose_class_colours
@@ -197,57 +196,6 @@ _MOST_PIECES = 24
 """Pieces of the files that are read: the order of patches is random, so a few pieces contain all kinds."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Patches:
-    """Patches of a dataset; for each sample its place in the files and its piece, (T,); ``step`` thins the pixels."""
-
-    files: PatchFiles
-    place: NDArray[np.int64]
-    piece: NDArray[np.int64]
-    step: int
-
-    def read(self, rows: NDArray[np.int64]) -> Mapping[str, NDArray[Any]]:
-        """Return thinned patches of these rows by layer, (N, px, px), or (N, px, px, 3) of an orthophoto in colour."""
-        place, piece = self.place[rows], self.piece[rows]
-        layers = list(self.files.layers)
-        stacks: dict[str, list[NDArray[np.generic]]] = {layer: [] for layer in layers}
-        order = np.argsort(piece, kind="stable")
-        for number in np.unique(piece).tolist():
-            pixels = self.files.read(number, layers)
-            indices = place[order][piece[order] == number] - self.files.starts[number]
-            for layer in layers:
-                stacks[layer].append(pixels[layer][indices][:, :: self.step, :: self.step])
-        back = np.argsort(order, kind="stable")
-        return _join_colours({layer: np.concatenate(parts)[back] for layer, parts in stacks.items()})
-
-    def select(self, samples: pa.Table) -> NDArray[np.int64]:
-        """Return up to `MOST_PATCHES` rows, rising, in turn from each split, class and 5° of slope: always the same.
-
-        ``samples`` are the first ones of the dataset.
-        """
-        piece = self.piece[: samples.num_rows]
-        pieces = np.unique(piece)
-        pieces = pieces[np.unique(np.linspace(0, len(pieces) - 1, _MOST_PIECES).astype(int))]
-        rows = np.flatnonzero(np.isin(piece, pieces))
-        near = samples.take(rows)
-        slope = np.floor(np.degrees(to_floats(near, "slope_rad")) / 5.0).tolist()
-        names = (near.column(name).to_pylist() for name in ("split", "terrain_name"))
-        turns = Counter[object]()
-        order = []
-        for row, key in zip(rows.tolist(), zip(*names, slope, strict=True), strict=True):
-            turns[key] += 1
-            order.append((turns[key], row))
-        return np.sort(np.array([row for _, row in sorted(order)[:MOST_PATCHES]], np.int64))
-
-
-def _open_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Patches:
-    files = open_patches(directory, card)
-    splits = samples.column("split").to_numpy(zero_copy_only=False)
-    place = find_places_in_files(card, splits)
-    piece = np.searchsorted(files.starts, place, side="right") - 1
-    return _Patches(files, place, piece, -(-card.patch_px // _PX))
-
-
 def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, count: int) -> Json:
     """Return sheets of patches by layer and the samples that they belong to, all among the first ``count``.
 
@@ -255,13 +203,38 @@ def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, cou
     """
     if not samples.num_rows:
         return None
-    patches = _open_patches(directory, card, samples)
-    rows = patches.select(samples.slice(0, count))
-    pixels, layers = patches.read(rows), list[Json]()
-    for name, stack in pixels.items():
-        sheet, exact = _make_sheet(stack, patches.files.layers[name])
+    files, step = open_patches(directory, card), -(-card.patch_px // _PX)
+    place = find_places_in_files(card, samples.column("split").to_numpy(zero_copy_only=False))
+    piece = np.searchsorted(files.starts, place, side="right") - 1
+    rows, stacks, layers = _select_rows(samples.slice(0, count), piece[:count]), dict[str, NDArray[Any]](), list[Json]()
+    for number in np.unique(piece[rows]).tolist():
+        here = np.flatnonzero(piece[rows] == number)
+        for layer, pixels in files.read(number, list(files.layers)).items():
+            thin = pixels[place[rows[here]] - files.starts[number], ::step, ::step]
+            stacks.setdefault(layer, np.empty((len(rows), *thin.shape[1:]), thin.dtype))[here] = thin
+    for name, stack in _join_colours(stacks).items():
+        sheet, exact = _make_sheet(stack, files.layers[name])
         layers.append({"name": name, "uri": make_picture_uri(sheet, exact=exact)})
-    return {"rows": rows.tolist(), "px": next(iter(pixels.values())).shape[1], "across": ACROSS, "layers": layers}
+    return {"rows": rows.tolist(), "px": next(iter(stacks.values())).shape[1], "across": ACROSS, "layers": layers}
+
+
+def _select_rows(samples: pa.Table, piece: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return up to `MOST_PATCHES` rows, rising, in turn from each split, class and 5° of slope: always the same.
+
+    ``piece`` is that of each sample's patch, shape (N,).
+    """
+    pieces = np.unique(piece)
+    pieces = pieces[np.unique(np.linspace(0, len(pieces) - 1, _MOST_PIECES).astype(int))]
+    rows = np.flatnonzero(np.isin(piece, pieces))
+    near = samples.take(rows)
+    slope = np.floor(np.degrees(to_floats(near, "slope_rad")) / 5.0).tolist()
+    names = (near.column(name).to_pylist() for name in ("split", "terrain_name"))
+    turns = Counter[object]()
+    order = []
+    for row, key in zip(rows.tolist(), zip(*names, slope, strict=True), strict=True):
+        turns[key] += 1
+        order.append((turns[key], row))
+    return np.sort(np.array([row for _, row in sorted(order)[:MOST_PATCHES]], np.int64))
 
 
 def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:

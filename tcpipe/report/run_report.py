@@ -32,7 +32,6 @@ from tcpipe.report.maps import RunMap, StoredMaps, draw_run_map
 from tcpipe.report.page import (
     Column,
     Link,
-    Number,
     PageSection,
     make_shown_column,
     pack_columns,
@@ -82,11 +81,11 @@ def run_report(run: StoredRun, maps: StoredMaps, *, made_from: str = "") -> str:
         lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {source}",
         verdict=show_verdict(manifest.verdict, manifest.info.report.findings),
         numbers=[
-            Number(f"{total:.0f} m", "driven"),
-            Number(f"{segments.num_rows}", "segments"),
-            Number(f"{100 * ledger.get('kept', 0.0) / max(total, 1e-9):.0f} %", "of the metres used"),
-            Number(_mean(segments, "power_watt", "W"), "mean power w"),
-            Number(_mean(segments, "velocity_mps", "m/s", digits=2), "mean velocity v"),
+            (f"{total:.0f} m", "driven"),
+            (f"{segments.num_rows}", "segments"),
+            (f"{100 * ledger.get('kept', 0.0) / max(total, 1e-9):.0f} %", "of the metres used"),
+            (_mean(segments, "power_watt", "W"), "mean power w"),
+            (_mean(segments, "velocity_mps", "m/s", digits=2), "mean velocity v"),
         ],
         links=[Link("All runs of the store", f"../../{REPORT}")] if run.place.size(REPORT) is not None else [],
         sections=[

@@ -20,7 +20,7 @@ from tcpipe.formats.runs import RunFacts
 from tcpipe.power.witnesses import compare_batteries
 from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.report.label_sections import make_losses_sections
-from tcpipe.report.page import Link, Number, PageSection, render_page, show_verdict
+from tcpipe.report.page import Link, PageSection, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
 from tcpipe.store import Store, counts
 from tcpipe.tables.findings import judge_by_code, select_problems
@@ -183,17 +183,17 @@ def store_report(content: StoreFacts, tracks: Plot | None = None) -> str:
     )
 
 
-def _make_numbers(content: StoreFacts, facts: Sequence[RunFacts]) -> list[Number]:
+def _make_numbers(content: StoreFacts, facts: Sequence[RunFacts]) -> list[tuple[str, str]]:
     driven_m, kept_m = (math.fsum(getattr(each, name) for each in facts) for name in ("driven_m", "kept_m"))
     floors = [each.energy_budget.total for each in facts if each.energy_budget]
     return [
-        Number(f"{len(facts)}", "runs"),
-        Number(f"{sum(run_facts.segments for run_facts in facts)}", "segments"),
-        Number(f"{driven_m:.0f} m", "driven"),
-        *([Number(f"{100 * kept_m / driven_m:.0f} %", "of the metres used")] if driven_m > 0 else []),
-        *([Number(f"{100 * float(np.median(floors)):.1f} %", "noise floor of E, median")] if floors else []),
-        Number(f"{sum(dataset.there for dataset in content.datasets)}", "datasets"),
-        *([Number(f"{len(content.failed)}", "logs without a run")] if content.failed else []),
+        (f"{len(facts)}", "runs"),
+        (f"{sum(run_facts.segments for run_facts in facts)}", "segments"),
+        (f"{driven_m:.0f} m", "driven"),
+        *([(f"{100 * kept_m / driven_m:.0f} %", "of the metres used")] if driven_m > 0 else []),
+        *([(f"{100 * float(np.median(floors)):.1f} %", "noise floor of E, median")] if floors else []),
+        (f"{sum(dataset.there for dataset in content.datasets)}", "datasets"),
+        *([(f"{len(content.failed)}", "logs without a run")] if content.failed else []),
     ]
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 from tcpipe.formats.finding_lines import group_findings
-from tcpipe.report.page import Link, Number, PageSection, Shaded, render_page, show_verdict
+from tcpipe.report.page import Link, PageSection, Shaded, render_page, show_verdict
 from tcpipe.report.plots import draw_waterfall, make_plot
 from tcpipe.tables.findings import Remedy, Subject, judge, make_finding, read_catalogue
 
@@ -46,7 +46,7 @@ def page():
     return render_page(
         title=EVIL,
         lead=EVIL,
-        numbers=[Number(EVIL, EVIL)],
+        numbers=[(EVIL, EVIL)],
         warnings=[EVIL],
         verdict=show_verdict(judge([evil]), [evil]),
         links=[Link(EVIL, EVIL), Link("plain", "javascript:alert(1)")],
