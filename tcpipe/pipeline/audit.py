@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import Floats, Ints
 from tcpipe.errors import FusionError, UsageError, clean_lines
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.logs.log_joining import open_single_log
@@ -51,19 +52,6 @@ class WithheldComparisons:
     length_ratios: dict[str, float]
 
 
-@dataclass(frozen=True, slots=True)
-class _Run:
-    """A run, and the section of it that is judged."""
-
-    run_id: str
-    streams: Streams
-    config: FuseConfig
-    section: Section
-
-    def fuse(self, streams: Streams) -> Track:
-        return fuse_run(streams, self.config, run_id=self.run_id)
-
-
 def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> WithheldComparisons:
     """Withhold fixes in windows of each length, and compare them with the track of the rest.
 
@@ -74,12 +62,12 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
     sections = prepare_sections(use_pose_as_fixes(streams)[0], config)
     if not sections:
         raise FusionError(f"{run_id}: no sensor measures motion")
-    run = _Run(run_id, streams, config, max(sections, key=lambda section: section.driven_m))
+    section, fuse = max(sections, key=lambda section: section.driven_m), partial(fuse_run, config=config, run_id=run_id)
     comparisons, skipped = list[Comparison](), list[str]()
-    gnss = run.section.measurements.gnss
+    gnss = section.measurements.gnss
     if gnss is None:
-        return WithheldComparisons((), ("without fixes",), _compare_lengths(run))
-    if not run.section.measurements.odometries():
+        return WithheldComparisons((), ("without fixes",), _compare_lengths(fuse(streams), section))
+    if not section.measurements.odometries():
         skipped.append("no other sensor measures motion")
     span_s = float(gnss.stamp_ns[-1] - gnss.stamp_ns[0]) * 1e-9
     for length_s in WINDOWS_S if not skipped else ():
@@ -88,7 +76,10 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
             skipped.append(f"{length_s:.0f} s: covers {span_s:.0f} s, {length_s + 2.0 * END_S:.0f} s are needed")
             break
         try:
-            comparisons.append(_compare_fixes(run, gnss, windows_ns))
+            step(f"fusing without {len(windows_ns)} x {length_s:.0f} s of fixes")
+            track = fuse(withhold(streams, section.clock_epoch, windows_ns))
+            arm_m = np.asarray(streams.sensors[find_fixes_role(streams)].xyz_m)
+            comparisons.append(_compare_fixes(track, section, gnss, windows_ns, arm_m))
         except FusionError as error:
             skipped.append(f"{length_s:.0f} s: {error.problems[0]}")
     return WithheldComparisons(tuple(comparisons), tuple(skipped), {})
@@ -98,22 +89,20 @@ _OTHER_ARM = {"lever-arm-unknown", "lever-arm-contradicted"}
 """Findings of an antenna that is elsewhere than stated."""
 
 
-def _compare_fixes(run: _Run, gnss: Positions, windows_ns: Ints) -> Comparison:
-    step(f"fusing without {len(windows_ns)} x {(windows_ns[0, 1] - windows_ns[0, 0]) * 1e-9:.0f} s of fixes")
-    track = run.fuse(withhold(run.streams, run.section.clock_epoch, windows_ns))
+def _compare_fixes(track: Track, section: Section, gnss: Positions, windows_ns: Ints, arm_m: Floats) -> Comparison:
     facts = track.info.report.facts
     if facts.fuse is not None and not {*FIXES}.intersection(facts.fuse.sensors):
         raise FusionError("tcpipe excludes the other fixes of the run")
-    rows = _select_rows(track, run.section)
+    rows = _select_rows(track, section)
     moving = np.array([rows.measure_length_m(*window) >= LEAST_WINDOW_M for window in windows_ns])
     if not moving.any():
         raise FusionError("the rest has no track in the windows, or the robot is stationary there")
     datum = track.info.datum
-    if datum is None or run.section.datum_deg_m is None:
+    if datum is None or section.datum_deg_m is None:
         raise FusionError("the track of the rest has only local coordinates")
-    places = geodetic_from_enu(gnss.position_enu_m, datum_deg_m=run.section.datum_deg_m)
+    places = geodetic_from_enu(gnss.position_enu_m, datum_deg_m=section.datum_deg_m)
     moved = enu_from_geodetic(*places, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m))
-    arm_m, arm_std_m = np.asarray(run.streams.sensors[find_fixes_role(run.streams)].xyz_m), np.zeros(3)
+    arm_std_m = np.zeros(3)
     if facts.fuse and any(finding.code in _OTHER_ARM for finding in track.info.report.findings):
         arm = facts.fuse.longest.parameters["antenna"]
         arm_m, arm_std_m = arm_m + arm.value, np.asarray(arm.std)
@@ -135,15 +124,15 @@ def withhold(streams: Streams, epoch: int, windows_ns: Ints) -> Streams:
     )
 
 
-def _compare_lengths(run: _Run) -> dict[str, float]:
+def _compare_lengths(track: Track, section: Section) -> dict[str, float]:
     """Return the horizontal length of the track over the distance that each odometry measures, by role."""
-    rows = _select_rows(run.fuse(run.streams), run.section)
+    rows = _select_rows(track, section)
     if rows.stamp_ns.size == 0:
         return {}
     ends_ns = rows.stamp_ns[[0, -1]]
     length_m = rows.measure_length_m(int(ends_ns[0]), int(ends_ns[1]) + 1)
     ratios = {}
-    for role, odometry in run.section.measurements.odometries().items():
+    for role, odometry in section.measurements.odometries().items():
         zero_ns, speed = int(odometry.stamp_ns[0]), np.abs(odometry.velocity_mps[:, :1])
         way_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero_ns), speed, compute_seconds(ends_ns, zero_ns))
         odometer_m = float(way_m[1, 0] - way_m[0, 0])

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.errors import clean_lines
@@ -94,7 +93,8 @@ def diff(a: Location, b: Location) -> Difference:
         "in both": len(in_a),
         **{name: int(mask.sum()) for name, mask in masks.items()},
     }
-    moved = _count_moved(*splits)
+    moves = {f"{a} to {b}": int(((splits[0] == a) & (splits[1] == b)).sum()) for a in SPLITS for b in SPLITS if a != b}
+    moved = {name: count for name, count in moves.items() if count}
     causes = list_causes(*cards)
     (ours, theirs) = (_find_all(card) for card in cards)
     gone, new = (
@@ -107,7 +107,15 @@ def diff(a: Location, b: Location) -> Difference:
         causes=causes,
         samples=counts,
         moved=moved,
-        labels=_compute_shifts(tables),
+        labels={
+            name: {
+                f"{what}_{end}": float(getattr(_read_values(table, name), what)())
+                for end, table in zip("ab", tables, strict=True)
+                for what in ("mean", "std")
+            }
+            for name in _LABELS
+            if all(map(len, tables))
+        },
         changes=_measure_changes((first, second)),
         findings_gone=gone,
         findings_new=new,
@@ -122,18 +130,6 @@ def _find_all(card: DatasetCard) -> dict[tuple[str, str, Subject], Finding]:
     """Return every finding of a dataset by its run or map, its code and its subject."""
     every = [("", card.findings), *card.findings_by_run.items(), *card.findings_by_map.items()]
     return {(where, finding.code, finding.subject): finding for where, findings in every for finding in findings}
-
-
-def _compute_shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:
-    values = {name: [_read_values(table, name) for table in tables] for name in _LABELS if all(map(len, tables))}
-    return {
-        name: {
-            f"{what}_{end}": float(getattr(samples, what)())
-            for end, samples in zip("ab", both, strict=True)
-            for what in ("mean", "std")
-        }
-        for name, both in values.items()
-    }
 
 
 def _read_values(table: pa.Table, name: str) -> Floats:
@@ -217,11 +213,6 @@ def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> Ints:
             hash(b"".join(part.tobytes() for part in parts)) for parts in zip(*flat, strict=True)
         ]
     return np.asarray(found[find_places_in_files(card, table.column("split").to_numpy())])
-
-
-def _count_moved(ours: NDArray[np.object_], theirs: NDArray[np.object_]) -> dict[str, int]:
-    moves = {f"{a} to {b}": int(((ours == a) & (theirs == b)).sum()) for a in SPLITS for b in SPLITS if a != b}
-    return {name: count for name, count in moves.items() if count}
 
 
 _WORDS = {

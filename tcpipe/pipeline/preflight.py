@@ -126,7 +126,10 @@ class Preflight:
             f"{self.log}: robot {self.robot or 'unknown'}",
             *(self.expected_yield.lines() if self.expected_yield else ()),
         ]
-        said += [f"topic     {_rate(topic)}" for topic in self.topics]
+        for topic in self.topics:
+            rate = "" if topic.rate_hz is None else f" at {topic.rate_hz:.3g} Hz"
+            wanted = "" if topic.wanted_hz is None else f" (needed {topic.wanted_hz:g})"
+            said.append(f"topic     {topic.role}: {topic.topic}{rate}{wanted}")
         said += [f"fails     {line}" for line in self.problems]
         if self.expected_yield:
             said += [f"verdict   {line}" for line in list_verdict(self.verdict)] + describe_power(self.verdict)
@@ -134,11 +137,6 @@ class Preflight:
         said += [f"loss      {format_loss(loss)}" for loss in self.losses]
         said += ["ready: no problems found"] if self.exit_code == 0 else []
         return clean_lines([*said, "", *self.recipe.splitlines()])
-
-
-def _rate(topic: RoleTopic) -> str:
-    rate = "" if topic.rate_hz is None else f" at {topic.rate_hz:.3g} Hz"
-    return f"{topic.role}: {topic.topic}{rate}" + ("" if topic.wanted_hz is None else f" (needed {topic.wanted_hz:g})")
 
 
 def preflight(
@@ -268,18 +266,10 @@ def find_slow(topics: Sequence[RoleTopic], expected_yield: ExpectedYield | None,
         ):
             yield make_finding("topic-incomplete", subject, names=names, present_fraction=topic.present_fraction)
     budget = expected_yield.energy_budget if expected_yield else None
-    if budget is not None and _is_ruled_by_rate(budget):
-        yield make_finding(
-            "power-rate-dominates",
-            Subject("role", "power"),
-            total_fraction=budget.total,
-            at_20_hz_fraction=budget.at_20_hz,
-        )
+    code = "power-rate-dominates"
+    least_share, gain = (read_threshold(code, f"{end}_fraction") for end in ("min_variance", "max_remaining"))
+    if budget and budget.rate**2 > least_share * budget.total**2 and budget.at_20_hz < gain * budget.total:
+        subject = Subject("role", "power")
+        yield make_finding(code, subject, total_fraction=budget.total, at_20_hz_fraction=budget.at_20_hz)
     if expected_yield is not None and span_s < read_threshold("log-too-short", "min_span_s"):
         yield make_finding("log-too-short", Subject("log", "log"), length_s=span_s)
-
-
-def _is_ruled_by_rate(budget: EnergyBudget) -> bool:
-    least_share = read_threshold("power-rate-dominates", "min_variance_fraction")
-    gain = read_threshold("power-rate-dominates", "max_remaining_fraction")
-    return budget.rate**2 > least_share * budget.total**2 and budget.at_20_hz < gain * budget.total

@@ -88,7 +88,14 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, sample
         title=f"Dataset {card.name}",
         lead=card.description or f"{card.format} format, data model {card.data_model_version}",
         verdict=show_verdict(judge_dataset(card.findings, card.runs, card.maps), groups=groups),
-        numbers=_make_numbers(card),
+        numbers=[
+            (f"{card.samples}", "samples"),
+            *((f"{card.splits[split]}", split) for split in SPLIT_COLOURS),
+            (f"{len(card.runs)}", "runs"),
+            (f"{sum(card.distance_by_reason_m.values()):.0f} m", "driven"),
+            (f"{100 * card.flagged_samples.share:.1f} %", "flagged samples"),
+            *(("none", name) for name in card.absent_labels),
+        ],
         links=[Link(f"All runs of {name}", f"../{name}/{REPORT}") for name in stores],
         warnings=lost,
         sections=[
@@ -120,17 +127,6 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, sample
 _SELECTION = PageSection(
     "Selected samples", "Patches and table show the selection. Travel is to the right.", controls="selection.html"
 )
-
-
-def _make_numbers(card: DatasetCard) -> list[tuple[str, str]]:
-    return [
-        (f"{card.samples}", "samples"),
-        *((f"{card.splits[split]}", split) for split in SPLIT_COLOURS),
-        (f"{len(card.runs)}", "runs"),
-        (f"{sum(card.distance_by_reason_m.values()):.0f} m", "driven"),
-        (f"{100 * card.flagged_samples.share:.1f} %", "flagged samples"),
-        *(("none", name) for name in card.absent_labels),
-    ]
 
 
 def _make_map_section(shown: int, count: int, plots: list[Plot]) -> PageSection:
@@ -317,10 +313,9 @@ def _find_indices(table: pa.Table, column: str, names: Sequence[str]) -> NDArray
 
 def find_first_starts_ns(card: DatasetCard, table: pa.Table) -> list[int]:
     """Return when each run's first sample begins [ns]; 0 where it has none."""
-    runs = _find_indices(table, "run_id", [run.run_id for run in card.runs])
-    first, last = np.full(len(card.runs), np.iinfo(np.int64).max), np.iinfo(np.int64).max
-    np.minimum.at(first, runs, table.column("start_ns").to_numpy())
-    return [int(stamp) if stamp != last else 0 for stamp in first]
+    first = table.select(["run_id", "start_ns"]).group_by("run_id").aggregate([("start_ns", "min")])
+    starts_ns = dict(zip(*(first.column(name).to_pylist() for name in ("run_id", "start_ns_min")), strict=True))
+    return [starts_ns.get(run.run_id, 0) for run in card.runs]
 
 
 def _find_odd_ids(table: pa.Table) -> Sequence[str] | None:

@@ -129,8 +129,7 @@ def describe_physics(robot: str, fit: PhysicsFit) -> str:
     text = f"{'; '.join(parts_of_text)}. Of all energy: {share} ({fit.segments} segments)."
     if fit.held_out is not None:
         text += f" On held-out fifths it explains {fit.held_out.r2:.2f} of the variance of E (R²), "
-        text += f"mean error {100 * fit.held_out.mape:.0f} % where it is 10 J and more"
-        text += "."
+        text += f"mean error {100 * fit.held_out.mape:.0f} % where it is 10 J and more."
     return text
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -204,47 +204,33 @@ def _compute_chord_speed(table: pa.Table, t_s: Floats) -> tuple[Floats, Floats]:
     return (t_s[rows][:-1] + apart_s / 2)[near], chord_m[near] / apart_s[near]
 
 
-@dataclass(frozen=True, slots=True)
-class Spans:
-    """Spans of the track whose rows have the same reasons: start, end [s] and bits, shape (M,) each."""
+def find_mask_spans(track: pa.Table, timeline: Timeline, rate_hz: float) -> dict[str, Column]:
+    """Return spans of the track whose rows have the same reasons, also of kept rows: start, end [s] and bits, (M,) each.
 
-    start_s: Floats
-    end_s: Floats
-    bits: Ints
-
-    def to_json(self) -> Json:
-        """Return the spans as the page's script reads them."""
-        return pack_columns({"start": ("f32", self.start_s), "end": ("f32", self.end_s), "bits": ("u16", self.bits)})
-
-
-def find_mask_spans(track: pa.Table, timeline: Timeline, rate_hz: float) -> Spans:
-    """Return the spans, also of kept rows (bits 0); a row lasts one period of the track, missing rows end a span."""
+    A row lasts one period of the track, missing rows end a span.
+    """
     t_s, bits = _compute_seconds(track, timeline), to_integers(track, "dropped_by")
     period_s = 1.0 / rate_hz
     begin = np.flatnonzero(np.r_[True, (np.diff(bits) != 0) | (np.diff(t_s) > 1.5 * period_s)])
     last = np.r_[begin[1:], len(t_s)] - 1
-    return Spans(t_s[begin] - period_s / 2, t_s[last] + period_s / 2, bits[begin])
+    ends_s = t_s[begin] - period_s / 2, t_s[last] + period_s / 2
+    return {"start": ("f32", ends_s[0]), "end": ("f32", ends_s[1]), "bits": ("u16", bits[begin])}
 
 
-@dataclass(frozen=True, slots=True)
-class FindingSpan:
-    """When an error or a warning holds, on the page's axis."""
-
-    finding: Finding
-    start_s: float
-    end_s: float
+FindingSpan = tuple[Finding, float, float]
+"""An error or a warning, and when it holds on the page's axis [s]."""
 
 
 def find_finding_spans(findings: Iterable[Finding], track: pa.Table, timeline: Timeline) -> list[FindingSpan]:
     """Return the spans of errors and warnings that have one; ends outside the clock epochs are seconds of the axis."""
-    spans, start_ns = [], int(to_integers(track, "stamp_ns")[0])
+    spans, start_ns = list[FindingSpan](), int(to_integers(track, "stamp_ns")[0])
     for finding in findings:
         if finding.severity == "note" or finding.span_s is None:
             continue
         ends_s = np.array(finding.span_s)
         on_axis_s = timeline.seconds(start_ns + np.round(ends_s * 1e9).astype(np.int64))
         start_s, end_s = np.clip(np.where(np.isnan(on_axis_s), ends_s, on_axis_s), 0.0, timeline.end_s).tolist()
-        spans.append(FindingSpan(finding, start_s, end_s))
+        spans.append((finding, start_s, end_s))
     return spans
 
 
@@ -272,46 +258,37 @@ _UNITS = {"power": "W", "current": "A", "voltage": "V", "speed": "m/s", "height"
 _MOST_REFUSED = 10_000
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A line of a plot: its name, and the series and column that it draws."""
+Line = tuple[str, str, str, str]
+"""A line: its plot, its name there, and the series and column that it draws."""
 
-    plot: str
-    name: str
-    series: str
-    column: str
-
-
-_TRACK_LINES = (
-    Line("power", "", "track", "power"),
-    Line("speed", "fused", "track", "speed"),
-    Line("speed", "wheels", "track", "wheels"),
-    Line("speed", "commanded", "track", "commanded"),
-    Line("height", "", "track", "height"),
-    Line("σ", "position (DRMS)", "track", "position_std"),
-    Line("σ", "height", "track", "height_std"),
-    Line("σ", "displacement over 1 s", "track", "chord_std"),
+_TRACK_LINES: tuple[Line, ...] = (
+    ("power", "", "track", "power"),
+    *(("speed", name, "track", column) for name, column in (("fused", "speed"), ("wheels",) * 2, ("commanded",) * 2)),
+    ("height", "", "track", "height"),
+    ("σ", "position (DRMS)", "track", "position_std"),
+    ("σ", "height", "track", "height_std"),
+    ("σ", "displacement over 1 s", "track", "chord_std"),
 )
 
 
 def make_trace_lines(series: Sequence[Series]) -> list[Line]:
     """Return the lines of these series, in the order of the page."""
     columns = {(part.name, column) for part in series for column in part.columns}
-    lines = [line for line in _TRACK_LINES if (line.series, line.column) in columns]
+    lines = [line for line in _TRACK_LINES if line[2:] in columns]
     for part in series:
         kind, _, rail = part.name.partition(" ")
         if kind in {"voltage", "current"}:
-            lines.append(Line(kind, rail, part.name, kind))
+            lines.append((kind, rail, part.name, kind))
         elif part.name in _SPEEDS:
-            lines.append(Line("speed", _SPEEDS[part.name], part.name, "speed"))
-    return sorted(lines, key=lambda line: list(_UNITS).index(line.plot))
+            lines.append(("speed", _SPEEDS[part.name], part.name, "speed"))
+    return sorted(lines, key=lambda line: list(_UNITS).index(line[0]))
 
 
 def time_plots(
     timeline: Timeline,
     *,
     lines: Sequence[Line],
-    spans: Spans,
+    spans: Mapping[str, Column],
     rejections: pa.Table,
     has_labels: bool,
     findings: Sequence[FindingSpan] = (),
@@ -320,17 +297,17 @@ def time_plots(
     first = _draw_masks(timeline, spans, findings)
     plots = [first]
     lines_json: list[Json] = []
-    for name in dict.fromkeys(line.plot for line in lines):
-        colours = _choose_colours([line.name for line in lines if line.plot == name])
+    for name in dict.fromkeys(plot for plot, *_ in lines):
+        drawn = [line for line in lines if line[0] == name]
+        colours = _choose_colours([line[1] for line in drawn])
         legend = colours if len(colours) > 1 else {}
         plot = _draw_panel(name, f"{name} [{_UNITS[name]}]", first, legend=legend)
         places = [f"line {len(lines_json) + number}" for number in range(len(colours))]
         for place, colour in reversed(list(zip(places, colours.values(), strict=True))):  # the first lies on top
             ends = {"t": [0.0, 1.0], "y": [0.0, 1.0]}  # until the page's script has unpacked the series
             plot.figure.line("t", "y", color=colour, line_width=1.3, source=ends, name=place)
-        lines_json += [
-            asdict(line) | {"colour": colours[line.name], "unit": _UNITS[name]} for line in lines if line.plot == name
-        ]
+        fields = ("plot", "name", "series", "column", "colour", "unit")
+        lines_json += [dict(zip(fields, (*line, colours[line[1]], _UNITS[name]), strict=True)) for line in drawn]
         plots.append(plot)
     plots += _draw_rejections(timeline, first, rejections)
     if has_labels:
@@ -372,21 +349,15 @@ def _draw_panel(name: str, label: str, first: Plot, *, legend: Mapping[str, str]
     return plot
 
 
-def _draw_masks(timeline: Timeline, spans: Spans, findings: Sequence[FindingSpan]) -> Plot:
+def _draw_masks(timeline: Timeline, spans: Mapping[str, Column], findings: Sequence[FindingSpan]) -> Plot:
     """Return the plot of findings, kept rows, and reasons for dropping the others; all plots share its time axis."""
     least_s = 0.004 * timeline.end_s  # so that a moment can be seen
     events = [
-        (
-            span.finding.code,
-            span.start_s,
-            max(span.end_s, span.start_s + least_s),
-            SEVERITY_COLOURS[span.finding.severity],
-            describe_finding(span.finding),
-        )
-        for span in findings
+        (one.code, start_s, max(end_s, start_s + least_s), SEVERITY_COLOURS[one.severity], describe_finding(one))
+        for one, start_s, end_s in findings
     ]
-    problems = dict.fromkeys(row for row, *_ in events)
-    reasons = [flag_name(bit).replace("_", " ") for bit in DropReason if (spans.bits & int(bit)).any()]
+    problems, bits = dict.fromkeys(row for row, *_ in events), spans["bits"][1].astype(np.int64)
+    reasons = [flag_name(bit).replace("_", " ") for bit in DropReason if (bits & int(bit)).any()]
     rows = [*problems, "kept", *reasons]
     plot = make_plot(
         "gates",

@@ -136,11 +136,11 @@ def _draw_run(
         "epochs": [[epoch.start_s, str(epoch.first_ns)] for epoch in timeline.epochs],
         "series": {part.name: part.to_json() for part in series},
         "lines": lines_json,
-        "spans": spans.to_json(),
+        "spans": pack_columns(spans),
         "segments": _make_segments_data(segments, timeline, run_map, findings=info.report.findings, spans=findings),
         "findings": [
-            [span.start_s, span.end_s, SEVERITY_COLOURS[span.finding.severity], *(span.finding.span_s or ())]
-            for span in findings
+            [start_s, end_s, SEVERITY_COLOURS[finding.severity], *(finding.span_s or ())]
+            for finding, start_s, end_s in findings
         ],
         "severities": [[name, SEVERITY_COLOURS[name]] for name in SEVERITIES],
         "starts": [str(stamp) for stamp in to_integers(segments, "start_ns").tolist()],
@@ -158,7 +158,7 @@ def _draw_run(
         "tall_by_wide": float(np.divide(*np.maximum(np.ptp(run_map.track_xy_m, axis=0), 1.0)[::-1])),
     }
     text = "Click on the track or a plot for details."
-    over = [_OVER_TIME, *([] if any(line.plot == "power" for line in lines) else ["There is no power."]), *lost]
+    over = [_OVER_TIME, *([] if any(plot == "power" for plot, *_ in lines) else ["There is no power."]), *lost]
     first, *others = over_time
     drive = PageSection(
         "The drive", " ".join([text, *run_map.missing]), controls="run.html", plots=[run_map.plot, first], stacked=True
@@ -220,7 +220,7 @@ def _find_severities(
     """Return the worst severity of each segment, by spans and flags: its place in `SEVERITIES`, or their number."""
     start_s, end_s = (np.asarray(columns[name][1], np.float64) for name in ("start", "end"))
     quality = np.asarray(columns["quality"][1], np.int64)
-    concerned = [(span.finding.severity, (start_s <= span.end_s) & (end_s >= span.start_s)) for span in spans]
+    concerned = [(finding.severity, (start_s <= last_s) & (end_s >= first_s)) for finding, first_s, last_s in spans]
     flags = {code: int(Quality[entry.flag.upper()]) for code, entry in read_catalogue().items() if entry.flag}
     concerned += [
         (finding.severity, (quality & flags[finding.code]) != 0) for finding in findings if finding.code in flags

@@ -70,7 +70,13 @@ def choose_runs(
             *(f"run {run_id}: excluded: {line}; ingest its log again with --force" for run_id, line in damaged.items())
         )
     if robot is None:
-        _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
+        generic = {run.run_id: run.facts.sensors for run in runs if run.facts.robot == GENERIC}
+        if differences := find_other_sensors(generic):
+            raise DatasetError(
+                f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; expected one: tag each "
+                "(tcpipe ingest LOG --tag robot=NAME) and choose it with --tag robot=NAME, or pool them with --robot generic",
+                *differences,
+            )
     otherwise = {
         row.run_id: {"what": "recipe", "has": row.recipe_id}
         if row.data_model_version == DATA_MODEL_VERSION
@@ -106,16 +112,6 @@ def _select_one_robot(store: Store, runs: list[StoredRun], robot: str | None) ->
     if robot is None and len(robots) > 1:
         raise DatasetError(f"{store.root}: runs of {len(robots)} robots ({', '.join(robots)}); name one with --robot")
     return wanted
-
-
-def _refuse_unlike(store: Store, runs: Iterable[StoredRun]) -> None:
-    """Raise an error if runs of the generic robot have different sensors."""
-    if differences := find_other_sensors({run.run_id: run.facts.sensors for run in runs}):
-        raise DatasetError(
-            f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; expected one: tag each "
-            "(tcpipe ingest LOG --tag robot=NAME) and choose it with --tag robot=NAME, or pool them with --robot generic",
-            *differences,
-        )
 
 
 def _select_tagged(store: Store, runs: list[StoredRun], tags: Mapping[str, str]) -> list[StoredRun]:
@@ -224,10 +220,6 @@ class Need:
         """Return the segments that have them, shape (M,)."""
         return np.asarray(np.all(np.isfinite([to_floats(segments, name) for name in self.columns]), axis=0))
 
-    def is_met_by(self, run: StoredRun) -> bool:
-        """Return whether any segment of a run has them."""
-        return bool(self.find_rows(run.table("segments", list(self.columns))).any())
-
 
 def list_needs(runs: Sequence[StoredRun], labels: Sequence[str], *, has_patches: bool) -> list[Need]:
     """Return what every sample needs: the requested labels, or energy if a run has it; and a position on the map.
@@ -241,7 +233,11 @@ def list_needs(runs: Sequence[StoredRun], labels: Sequence[str], *, has_patches:
         if name in (labels or ("energy",))
     ]
     optional = [*([] if labels else needs), *([] if has_patches else [position])]
-    dropped = [need for need in optional if not any(map(need.is_met_by, runs))]
+    dropped = [
+        need
+        for need in optional
+        if not any(need.find_rows(run.table("segments", [*need.columns])).any() for run in runs)
+    ]
     return [need for need in (*needs, position) if need not in dropped]
 
 

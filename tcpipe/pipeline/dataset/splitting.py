@@ -57,21 +57,27 @@ def draw_splits(
     for first in range(0, len(rows), _ROWS):
         names = take_rows(ids, rows[first : first + _ROWS]).column(0).to_pylist()
         ranks[first : first + _ROWS] = hash_ranks(names, seed=rules.seed, purpose="test")
+    planar, tagged = None, None
+    if regions is not None and projection is not None:
+        west, south = (sampled.footprint_lonlat_deg.min(axis=(0, 1)) - _MARGIN_DEG).tolist()
+        east, north = (sampled.footprint_lonlat_deg.max(axis=(0, 1)) + _MARGIN_DEG).tolist()
+        planar = project_regions(regions, projection.forward, window_deg=(west, south, east, north))
+    if tags is not None:
+        values = list(dict.fromkeys(tags[name] for name in run_names))
+        tagged = np.array([values.index(tags[name]) for name in run_names], np.int32)[run], values
     assigned = assign_splits(
         ranks,
         run,
         run_names,
         sampled.footprint_xy_m,
-        None
-        if regions is None or projection is None
-        else _project_regions(regions, projection, sampled.footprint_lonlat_deg),
+        planar,
         holdout=rules.holdout,
         test_fraction=rules.test_fraction,
         block_m=rules.block_m,
         buffer_m=buffer_m,
         folds=rules.folds,
         seed=rules.seed,
-        tagged=None if tags is None else _number_values(run, [tags[name] for name in run_names]),
+        tagged=tagged,
     )
     del ranks
     if regions is not None and not assigned.is_in("train", "test").any():
@@ -94,18 +100,6 @@ def number_runs(segments: pa.Table) -> tuple[NDArray[np.int32], list[str]]:
     number = np.empty(len(names), np.int32)
     number[order] = np.arange(len(names))
     return number[codes], [names[code] for code in order]
-
-
-def _number_values(run: NDArray[np.int32], values: list[str]) -> tuple[NDArray[np.int32], list[str]]:
-    """Return the number of each sample's value, (N,), and the values by number; run i has ``values[i]``."""
-    names = list(dict.fromkeys(values))
-    return np.array([names.index(value) for value in values], np.int32)[run], names
-
-
-def _project_regions(regions: Regions, projection: Projection, footprint_lonlat_deg: Floats) -> Regions:
-    west, south = (footprint_lonlat_deg.min(axis=(0, 1)) - _MARGIN_DEG).tolist()
-    east, north = (footprint_lonlat_deg.max(axis=(0, 1)) + _MARGIN_DEG).tolist()
-    return project_regions(regions, projection.forward, window_deg=(west, south, east, north))
 
 
 def _describe_nothing_inside(regions: Regions, lonlat_deg: Floats, assigned: Assignment) -> str:

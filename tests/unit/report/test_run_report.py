@@ -62,9 +62,9 @@ def test_a_span_ends_where_the_reason_or_the_track_does():
         [track.slice(0, 40), track.slice(60)]
     )  # two seconds, a second is missing, three more standing
     spans = find_mask_spans(without, make_timeline(without), 20.0)
-    assert spans.bits.tolist() == [2, 2, 0]
-    assert spans.start_s == pytest.approx([-0.025, 2.975, 4.975])
-    assert spans.end_s[:2] == pytest.approx([1.975, 4.975])
+    assert spans["bits"][1].tolist() == [2, 2, 0]
+    assert spans["start"][1] == pytest.approx([-0.025, 2.975, 4.975])
+    assert spans["end"][1][:2] == pytest.approx([1.975, 4.975])
 
 
 def test_rails_that_tell_current_and_voltage_in_turn_are_series_of_their_own():
