@@ -13,6 +13,7 @@ import time
 
 import numpy as np
 
+from tcpipe.learning.predictor import Inputs
 from tcpipe.learning.table_model import compute_patch_features, fit_table
 
 WANTED_S, WANTED_A_SECOND = 20.0, 100_000
@@ -34,13 +35,13 @@ def main() -> None:
     )
     labels = [100.0, 0.8] + [20.0, 0.1] * ground + rng.normal(size=ground.shape) * [5.0, 0.02]
     began = time.process_time()
-    folds, rules = rng.integers(0, 5, count), {"channels": CHANNELS, "class_count": CLASSES}
-    model, _, count_of_trees = fit_table(features, labels, folds, **rules)
+    inputs = Inputs(CHANNELS, 40, CHANNELS, 1.0, CLASSES, (), ("power_watt", "velocity_mps"), (1.0, 1.0))
+    model, _, count_of_trees = fit_table(features, labels, rng.integers(0, 5, count), inputs)
     grown_s = time.process_time() - began
     many = np.resize(features, (TOLD, 16))
-    model.predict(many[:10])
+    model.predict_table(many[:10])
     began = time.process_time()
-    model.predict(many)
+    model.predict_table(many)
     rate = TOLD / (time.process_time() - began)
     print(
         f"{count} samples: {seen_s:.1f} s for features, {grown_s:.1f} s for trees (goal together at most {WANTED_S:.0f} s of 10,000)"

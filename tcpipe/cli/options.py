@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from contextlib import nullcontext, suppress
 from dataclasses import MISSING, fields, replace
 from functools import partial, wraps
+from importlib import import_module
 from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -116,15 +117,9 @@ def _list_runs(store: Store) -> Iterable[str]:
     return sorted({run.run_id for run in store.scan().runs.values()})
 
 
-def _list_scenarios(_: click.Context) -> Iterable[str]:
-    from tcpipe.simulation.scenarios import SCENARIOS
-
-    return SCENARIOS
-
-
 complete_robots = _complete_names(_list_robots)
 """Offers the robots that the recipe knows."""
-complete_scenarios = _complete_names(_list_scenarios)
+complete_scenarios = _complete_names(lambda _: import_module("tcpipe.simulation.scenarios").SCENARIOS)
 """Offers the sites that can be simulated."""
 complete_runs = _complete_names(lambda context: _list_runs(store) if (store := _store(context)) else ())
 """Offers the store's runs."""

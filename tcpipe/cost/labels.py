@@ -263,16 +263,3 @@ def spans_near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: 
     first = np.searchsorted(ordered, start_m - within_m, side="left")
     last = np.searchsorted(ordered, end_m + within_m, side="right")
     return last > first
-
-
-def has_slip(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> Mask:
-    """Return where wheel and body speed differ by over a share of the wheel speed, shape (M,); False if unknown.
-
-    Both are means over the segment along the body's x axis [m/s]: along the slope, not horizontal.
-    """
-    return np.abs(wheel_mps - ground_mps) > above * np.abs(wheel_mps)
-
-
-def has_mean_mismatch(mean_watt: Floats, power_watt: Floats, *, above: float = 0.05) -> Mask:
-    """Return where plain and time-weighted mean power differ by more than a share of the latter; False if unknown."""
-    return np.abs(mean_watt - power_watt) > above * np.abs(power_watt)

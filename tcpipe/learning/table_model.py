@@ -30,7 +30,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Floats32, Ints
-from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeatures, standardize_features
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm, check_arrays
@@ -216,66 +215,23 @@ def _load_lightgbm() -> Any:
 
 
 @dataclass(frozen=True)
-class TableModel:
-    """Curves and trees; ``channels`` and ``class_count`` give the columns of slope and class in the features."""
+class BoostingModel(Predictor):
+    """Curves and trees over the features of patches."""
 
     curves: Curves
     trees: tuple[str, ...]
     """LightGBM's text of each output."""
-    channels: tuple[str, ...]
-    class_count: int
+    inputs: Inputs
 
     @cached_property
     def _boosters(self) -> list[Any]:
         return [_load_lightgbm().Booster(model_str=text) for text in self.trees]
 
-    def predict(self, features: Floats) -> Floats:
+    def predict_table(self, features: Floats) -> Floats:
         """Return outputs, shape (N, outputs), of features, shape (N, features)."""
-        slope_rad, class_id = find_slope_and_class(features, self.channels, self.class_count)
-        curves = self.curves.predict(slope_rad, class_id)
+        curves = self.curves.predict(*find_slope_and_class(features, self.inputs.planes, self.inputs.class_count))
         found = [np.asarray(booster.predict(features, num_threads=1)) for booster in self._boosters]
         return np.asarray(curves + np.column_stack(found))
-
-    def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return curves and trees by name."""
-        texts = {f"trees_{at}": np.frombuffer(text.encode(), np.uint8) for at, text in enumerate(self.trees)}
-        return {**texts, **self.curves.arrays()}
-
-
-def fit_table(
-    features: Floats,
-    labels: Floats,
-    folds: NDArray[np.generic],
-    *,
-    channels: Sequence[str],
-    class_count: int,
-    config: TrainConfig | None = None,
-) -> tuple[TableModel, Floats, int]:
-    """Fit curves, and trees to the residuals of curves of the other folds.
-
-    Returns also each sample's prediction by the other folds, and the largest number of trees of an output.
-
-    Parameters
-    ----------
-    features : finite, shape (N, features): those of the channels, then any others.
-    labels : shape (N, outputs).
-    folds : of each sample, shape (N,); at least two.
-    channels, class_count : what the features are of.
-    config : settings of LightGBM.
-    """
-    slope_rad, class_id = find_slope_and_class(features, channels, class_count)
-    curve_labels = cross_fit_curves(slope_rad, class_id, labels, folds)
-    trees, held_out, count = grow(features, labels - curve_labels, folds, config)
-    curves = fit_curves(slope_rad, class_id, labels)
-    return TableModel(curves, trees, tuple(channels), class_count), curve_labels + held_out, count
-
-
-@dataclass(frozen=True, slots=True)
-class BoostingModel(Predictor):
-    """A table model of patches: it computes their features."""
-
-    table: TableModel
-    inputs: Inputs
 
     def predict(self, patches: Patches, features: ExtraFeatures) -> Floats:
         """Return outputs, shape (N, outputs)."""
@@ -283,12 +239,14 @@ class BoostingModel(Predictor):
         out = np.empty((len(patches), len(self.inputs.outputs)))
         for first in range(0, len(patches), _TOGETHER):
             rows = slice(first, first + _TOGETHER)
-            out[rows] = self.table.predict(np.column_stack([self._compute_features(patches[rows]), numbers[rows]]))
+            plain = _compute_features(patches[rows], self.inputs)
+            out[rows] = self.predict_table(np.column_stack([plain, numbers[rows]]))
         return out
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return curves and trees by name."""
-        return self.table.arrays()
+        texts = {f"trees_{at}": np.frombuffer(text.encode(), np.uint8) for at, text in enumerate(self.trees)}
+        return {**texts, **self.curves.arrays()}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> BoostingModel:
@@ -299,7 +257,7 @@ class BoostingModel(Predictor):
         last = list(_locate_features((*inputs.planes, ""), inputs.class_count))[-1]
         known = last[1] + len(inputs.extra_features)
         trees = tuple(clean_trees(arrays[name].tobytes().decode(errors="replace"), known) for name in texts)
-        return cls(TableModel(curves, trees, inputs.planes, inputs.class_count), inputs)
+        return cls(curves, trees, inputs)
 
     @classmethod
     def fit(cls, samples: Samples) -> Predictor:
@@ -313,33 +271,44 @@ class BoostingModel(Predictor):
         require_folds(samples.folds)
         began, inputs = time.perf_counter(), samples.inputs
         numbers = standardize_features(inputs.extra_features, samples.features)
-        plain = compute_features(samples.split, inputs.patch_m, inputs.class_count)
-        features = np.column_stack([plain, numbers])
-        table, held_out, trees = fit_table(
-            features,
-            samples.labels,
-            samples.folds,
-            channels=inputs.planes,
-            class_count=inputs.class_count,
-            config=samples.config,
-        )
+        parts, together = list[Floats](), samples.split.view.form.batch_rows
+        for first in range(0, len(samples), together):
+            patches = samples.split.batch(np.arange(first, min(first + together, len(samples))))[0]
+            parts.append(_compute_features(patches, inputs))
+        features = np.column_stack([np.concatenate(parts), numbers])
+        model, held_out, trees = fit_table(features, samples.labels, samples.folds, inputs, samples.config)
         times = TrainingTimes(time.perf_counter() - began, len(samples))
-        return Fitted(cls(table, inputs), Prediction.without_covariance(held_out), trees, trees, training_times_s=times)
-
-    def _compute_features(self, patches: Patches) -> Floats:
-        inputs = self.inputs
-        return compute_patch_features(
-            patches, channels=inputs.planes, class_count=inputs.class_count, patch_m=inputs.patch_m
-        )
+        return Fitted(model, Prediction.without_covariance(held_out), trees, trees, training_times_s=times)
 
 
 _TOGETHER = 256
 
 
-def compute_features(split: Split, patch_m: float, class_count: int) -> Floats:
-    """Return the features of all samples, shape (N, features); patches are formed some at a time."""
-    parts, layout = list[Floats](), split.view.form
-    for first in range(0, len(split), layout.batch_rows):
-        patches = split.batch(np.arange(first, min(first + layout.batch_rows, len(split))))[0]
-        parts.append(compute_patch_features(patches, channels=layout.planes, class_count=class_count, patch_m=patch_m))
-    return np.concatenate(parts)
+def _compute_features(patches: Patches, inputs: Inputs) -> Floats:
+    planes = inputs.planes
+    return compute_patch_features(patches, channels=planes, class_count=inputs.class_count, patch_m=inputs.patch_m)
+
+
+def fit_table(
+    features: Floats,
+    labels: Floats,
+    folds: NDArray[np.generic],
+    inputs: Inputs,
+    config: TrainConfig | None = None,
+) -> tuple[BoostingModel, Floats, int]:
+    """Fit curves, and trees to the residuals of curves of the other folds.
+
+    Returns also each sample's prediction by the other folds, and the largest number of trees of an output.
+
+    Parameters
+    ----------
+    features : finite, shape (N, features): those of the inputs' planes, then any others.
+    labels : shape (N, outputs).
+    folds : of each sample, shape (N,); at least two.
+    inputs, config : what the features are of, and settings of LightGBM.
+    """
+    slope_rad, class_id = find_slope_and_class(features, inputs.planes, inputs.class_count)
+    curve_labels = cross_fit_curves(slope_rad, class_id, labels, folds)
+    trees, held_out, count = grow(features, labels - curve_labels, folds, config)
+    model = BoostingModel(fit_curves(slope_rad, class_id, labels), trees, inputs)
+    return model, curve_labels + held_out, count

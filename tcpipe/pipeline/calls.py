@@ -221,11 +221,6 @@ def _is_done_by(call: Call, other: Call) -> bool:
     )
 
 
-def list_ended_calls(state: State) -> list[Call]:
-    """Return the calls that have ended, the latest first."""
-    return [call for _, call in state.calls if call.exit_code is not None]
-
-
 INGEST, BUILD, ADD_MAP, PRUNE, ACKNOWLEDGE = "ingest", "build-dataset", "add-map", "prune", "acknowledge"
 
 

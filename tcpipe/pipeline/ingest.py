@@ -23,7 +23,6 @@ from tcpipe.formats.runs import LogFailure, find_lineage, find_problems, make_fa
 from tcpipe.pipeline.calls import INGEST, RunningCall, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.log_sources import (
-    FoundLogs,
     LogSource,
     find_failure,
     list_log_sources,
@@ -177,7 +176,11 @@ def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path, *, is_
 
     steps = plan_ingestion(tasks, call.state)
     _announce_new_results(steps, call.state)
-    tell(chain(_iterate_missing(found), _iterate_finished(call.state, steps)))
+    missing = (
+        IngestResult(name, "failed", causes=find_failure(name, "LogError"), problems=lines, transient=True)
+        for name, lines in ((clean_line(path), lines) for path, lines in found.problems.items())
+    )
+    tell(chain(enumerate(missing, start=-len(found.problems)), _iterate_finished(call.state, steps)))
     if any(step.is_todo for step in steps):
         call.begin()
         if call.error is not None:  # before logs are read for hours
@@ -224,14 +227,6 @@ def _describe_call(summary: IngestSummary) -> dict[str, Json]:
             result.log: result.problems[0] for result in summary.results if result.transient and result.problems
         },
     }
-
-
-def _iterate_missing(found: FoundLogs) -> Iterator[tuple[int, IngestResult]]:
-    """Yield the result of each path that holds no log."""
-    for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
-        name = clean_line(path)
-        findings = find_failure(name, "LogError")
-        yield index, IngestResult(name, "failed", causes=findings, problems=lines, transient=True)
 
 
 def _iterate_finished(state: State, steps: Sequence[PlannedLog]) -> Iterator[tuple[int, IngestResult]]:

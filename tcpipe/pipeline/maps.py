@@ -166,12 +166,6 @@ def _describe_no_file(text: str) -> str:
     return f"{text}: no file matches" if glob.has_magic(text) else f"{text}: there is no such file"
 
 
-def _name_files(files: Iterable[Path], paths: Sequence[Path]) -> tuple[str, ...]:
-    """Return the names of files below the folder that the files of a role share."""
-    folder = os.path.commonpath([path.absolute().parent for path in paths])
-    return tuple(os.path.relpath(file, folder) for file in files)
-
-
 def _compute_checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, str]]:
     """Return a checksum for every file of every role, in their order; the order of options does not count."""
     checksums: dict[str, dict[str, str]] = {}
@@ -181,7 +175,8 @@ def _compute_checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[st
             plain = role.endswith(CLASSES) or (role == "terrain" and is_drawn(paths))
             parts = dict.fromkeys(part for path in paths for part in ([path] if plain else list_raster_files(path)))
             digests = [compute_checksum(part).sha256 for part in parts]
-            checksums[role] = dict(zip(_name_files(parts, paths), digests, strict=True))
+            folder = os.path.commonpath([path.absolute().parent for path in paths])
+            checksums[role] = dict(zip((os.path.relpath(part, folder) for part in parts), digests, strict=True))
         except MapError as error:
             problems += error.problems
         except OSError as error:

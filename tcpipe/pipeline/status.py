@@ -18,7 +18,7 @@ from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_findin
 from tcpipe.formats.object_storage import format_path
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.runs import Call, Problem
-from tcpipe.pipeline.calls import INGEST, OpenCall, format_duration, list_ended_calls, list_open_calls
+from tcpipe.pipeline.calls import INGEST, OpenCall, format_duration, list_open_calls
 from tcpipe.pipeline.ingest import CallOptions, make_tasks
 from tcpipe.pipeline.log_sources import list_log_sources, select_shard
 from tcpipe.pipeline.options import IngestOptions
@@ -136,7 +136,7 @@ def find_log_states(options: IngestOptions, *, create: bool = False) -> Status:
         gone=tuple(chain(*(lines for path, lines in missing.items() if path not in lately))),
         superseded_runs=sum(bool(row.superseded_by) for row in state.runs.values()),
         open_calls=tuple(call for call in open_calls if call.problem.key not in acknowledged),
-        history=tuple(list_ended_calls(state)[:_LATEST_CALLS]),
+        history=tuple(call for _, call in state.calls if call.exit_code is not None)[:_LATEST_CALLS],
         runs=len(current),
         findings={group.code: len(group.of) for group in by_code},
         exit_code=3 if problems or any(group.state in TROUBLE for group in groups) else 0,

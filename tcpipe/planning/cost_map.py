@@ -296,7 +296,12 @@ def _write_files(directory: Path, strips: _Strips, frame: Frame) -> dict[str, Na
         strip = partial(strips.compute, name)
         write_cog(directory / f"{name}.tif", strip, grid, dtype="float32", bands=bands)
     bands = [(band, "bits") for band in (*_BAND_NAMES, "all courses")]
-    write_cog(directory / "reasons.tif", partial(_read_reasons, costs), grid, dtype="uint16", bands=bands)
+
+    def read_reasons(first: int, last: int) -> NDArray[np.uint16]:
+        bits = np.asarray(costs.reasons[:, first:last])
+        return np.concatenate([bits, np.bitwise_and.reduce(bits, axis=0)[None]])
+
+    write_cog(directory / "reasons.tif", read_reasons, grid, dtype="uint16", bands=bands)
     height = [("height", "m")]
     write_cog(
         directory / "height.tif",
@@ -347,11 +352,6 @@ def _mean(values: NDArray[np.floating]) -> Floats:
     count = known.sum(axis=0)
     total = np.where(known, values, 0.0).sum(axis=0, dtype=np.float64)
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
-
-
-def _read_reasons(costs: CostGrid, first: int, last: int) -> NDArray[np.uint16]:
-    bits = np.asarray(costs.reasons[:, first:last])
-    return np.concatenate([bits, np.bitwise_and.reduce(bits, axis=0)[None]])
 
 
 def _compute_mean(strips: _Strips, name: str) -> Floats:

@@ -194,10 +194,6 @@ class Surface:
         relief += self._by_class("ridge_m")[classes] * evaluate_field(self.ridges, u, v)
         return np.asarray(relief * (1.0 + self.swing * state(self.roughness, u, v)))
 
-    def map_noise_m(self, u: Floats, v: Floats) -> Floats:
-        """Return what the height raster errs by [m]."""
-        return self.map_noise_std_m * evaluate_field(self.noise, u, v)
-
     def _by_class(self, name: str) -> Floats:
         """Return a property of the appearance of every class, by class id, shape (256,)."""
         table = np.zeros(256)
@@ -320,7 +316,8 @@ class World:
             return height
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         classes = self.terrain_class(x_map_m, y_map_m)
-        return height + self.surface.relief_m(classes, u, v) + self.surface.map_noise_m(u, v)
+        noise_m = self.surface.map_noise_std_m * evaluate_field(self.surface.noise, u, v)
+        return height + self.surface.relief_m(classes, u, v) + noise_m
 
     def gradient(self, x_map_m: Floats, y_map_m: Floats) -> tuple[Floats, Floats]:
         """Return the rise per map metre along the map's x and y."""

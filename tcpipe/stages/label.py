@@ -16,7 +16,6 @@ from tcpipe.cost.labels import (
     SensorError,
     combine_flags,
     compute_labels,
-    has_mean_mismatch,
     subtract_idle_power,
 )
 from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_physics
@@ -101,7 +100,7 @@ def label_segments(
         spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
         count, mean_watt = count_samples_inside(rails, *spans)
         flags = {
-            Quality.POWER_MEAN_MISMATCH: has_mean_mismatch(mean_watt, cost.power_watt),
+            Quality.POWER_MEAN_MISMATCH: np.abs(mean_watt - cost.power_watt) > _MISMATCH * np.abs(cost.power_watt),
             Quality.CLOCK_DOUBTFUL: np.full(cut.num_rows, is_clock_doubtful(streams, masked.info)),
             **find_power_flags(cut, rails, range_volt=robot.voltage_range_volt),
             **find_motion_flags(
@@ -229,6 +228,8 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
     )
 
 
+_MISMATCH = 0.05
+"""Share of the mean power by which the plain mean of its samples may differ."""
 _EDGE_S = 0.3
 """After a stop and before a start motors draw."""
 

@@ -17,7 +17,6 @@ from tcpipe.cost.labels import (
     find_noise,
     find_wanted_rate,
     has_low_power_rate,
-    has_slip,
     spans_near,
     touches_voltage_outside,
 )
@@ -40,6 +39,8 @@ Arrays = dict[str, Floats]
 
 _ROLLING_MPS = 0.05
 """Wheels slower than this are stationary: their slip is unknown."""
+_SLIPPING = 0.2
+"""Share of the wheels' speed, a mean along the slope, by which that of the robot may differ."""
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 """Range of the median specific force [m/s²]; outside (other unit, gravity removed) the vibration is unknown."""
 
@@ -152,7 +153,7 @@ def find_motion_flags(
         Quality.NEAR_GAP: spans_near(
             driven_m[_find_gap_edges(rows, info.rate_hz)], start_m, end_m, within_m=float(chord_m[0])
         ),
-        Quality.HIGH_SLIP: has_slip(wheel_mps, to_floats(cut, "fused_velocity_mps")),
+        Quality.HIGH_SLIP: np.abs(wheel_mps - to_floats(cut, "fused_velocity_mps")) > _SLIPPING * np.abs(wheel_mps),
         Quality.WEAK_GNSS: to_floats(cut, "position_std_m") > max_position_std_m,
         Quality.CURVED: to_floats(cut, "arc_length_m") > arc_to_chord * chord_m,
         Quality.NO_COMMAND: np.isnan(commanded_mps),

@@ -44,10 +44,6 @@ class _Comparison:
         """By how much the ratio is outside of the range, as a logarithm."""
         return float(max(np.log(abs(self.ratio) / self.high), np.log(self.low / max(abs(self.ratio), 1e-9))))
 
-    def find_scale(self) -> float:
-        """Return the power of ten, a factor on the current, that brings the ratio nearest to its range's middle."""
-        return float(10.0 ** -round(np.log10(abs(self.ratio) / np.sqrt(self.low * self.high))))
-
 
 def find_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> Iterator[Finding]:
     """Yield what confirms each label of labelled segments, and what contradicts the power; nothing without segments."""
@@ -110,7 +106,8 @@ def _find_energy_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> 
 def _make_implausible(worst: _Comparison, comparisons: list[_Comparison]) -> Finding:
     """Return the finding that a witness contradicts the scale of power; a warning if another one confirms it."""
     bound, limit = ("largest", worst.high) if worst.ratio > worst.high else ("smallest", worst.low)
-    scale = worst.find_scale()
+    # The power of ten, a factor on the current, that brings the ratio nearest to the middle of its range.
+    scale = float(10.0 ** -round(np.log10(abs(worst.ratio) / np.sqrt(worst.low * worst.high))))
     is_clear = worst.excess > np.log(read_threshold(IMPLAUSIBLE, "min_unit_excess_ratio"))
     is_remedy = is_clear and scale != 1.0 and all(each.low < each.ratio * scale < each.high for each in comparisons)
     return make_finding(

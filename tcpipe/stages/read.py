@@ -71,21 +71,13 @@ def decide_roles(config: ReadConfig, topics: Iterable[Topic], robot: str | None,
         for role in config.time_offset_s
         if role not in assignment.roles
     )
-    return replace(
-        assignment, problems=problems, findings=(*assignment.findings, *_find_unused_keys(config, assignment))
+    unused = (
+        make_finding("recipe-key-unused", Subject("role", role), names={"key": f"read.{key}.{role}"})
+        for key in ("extrinsics", "odometry_scale", "time_source")
+        for role in getattr(config, key)
+        if role not in assignment.roles
     )
-
-
-def _find_unused_keys(config: ReadConfig, assignment: RoleAssignment) -> Iterator[Finding]:
-    """Yield a finding for each key of the recipe that is for a role without a topic."""
-    for key, given in (
-        ("extrinsics", config.extrinsics),
-        ("odometry_scale", config.odometry_scale),
-        ("time_source", config.time_source),
-    ):
-        for role in given:
-            if role not in assignment.roles:
-                yield make_finding("recipe-key-unused", Subject("role", role), names={"key": f"read.{key}.{role}"})
+    return replace(assignment, problems=problems, findings=(*assignment.findings, *unused))
 
 
 def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Profiles) -> Streams:

@@ -351,7 +351,10 @@ def _is_one_drive(pair: tuple[StoredRun, StoredRun]) -> bool | None:
     One sensor with equal values proves one drive, other values of topics of one name prove two; else the tag ``robot``
     decides.
     """
-    files = [_find_streams(run) for run in pair]
+    files = [dict[str, Path](), dict[str, Path]()]
+    for number, run in enumerate(pair):
+        with suppress(StoreError):  # a stream that is not as it was written proves nothing
+            files[number] = run.stream_files()
     sensors = [run.facts.sensors for run in pair]
     for role in (role for role in _COMPARED_ROLES if all(role in found for found in files)):
         fraction = _compute_equal_fraction([read_table(found[role]) for found in files])
@@ -362,13 +365,6 @@ def _is_one_drive(pair: tuple[StoredRun, StoredRun]) -> bool | None:
             return False
     tags = [run.facts.tags.get("robot") for run in pair]
     return tags[0] == tags[1] if any(tags) else None
-
-
-def _find_streams(run: StoredRun) -> dict[str, Path]:
-    """Return the files of the streams of a run; none where one is not as it was written."""
-    with suppress(StoreError):
-        return run.stream_files()
-    return {}
 
 
 def _compute_equal_fraction(streams: Sequence[pa.Table]) -> float:

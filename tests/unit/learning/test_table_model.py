@@ -112,6 +112,7 @@ def test_without_lightgbm_there_is_one_line(monkeypatch):
 pytest.importorskip("lightgbm")
 
 CHANNELS, CLASSES = ("ortho", "terrain", "height"), 5
+INPUTS = Inputs(CHANNELS, 40, CHANNELS, 1.0, CLASSES, (), ("power_watt", "velocity_mps"), (1.0, 1.0))
 
 
 def ground(count=900, steepest=0.2, seed=0):
@@ -128,13 +129,13 @@ def ground(count=900, steepest=0.2, seed=0):
 @pytest.fixture(scope="module")
 def fitted():
     features, labels, folds = ground()
-    return fit_table(features, labels, folds, channels=CHANNELS, class_count=CLASSES)
+    return fit_table(features, labels, folds, INPUTS)
 
 
 def test_steeper_ground_than_any_goes_on_straight_and_texture_is_heeded(fitted):
     model, *_ = fitted
     features, labels, _ = ground(300, steepest=0.4, seed=1)
-    said = model.predict(features)
+    said = model.predict_table(features)
     assert np.abs(said[:, 0] - labels[:, 0]).mean() < 4.0
     assert said[:, 1] == pytest.approx(labels[:, 1], abs=0.02)
 
@@ -146,7 +147,11 @@ def test_what_the_other_folds_said_is_no_better_than_what_is_new(fitted):
     new, told, _ = ground(seed=2)
     seen, held, unseen = (
         np.abs(said[:, 0] - wanted[:, 0]).mean()
-        for said, wanted in ((model.predict(features), labels), (held_out, labels), (model.predict(new), told))
+        for said, wanted in (
+            (model.predict_table(features), labels),
+            (held_out, labels),
+            (model.predict_table(new), told),
+        )
     )
     assert seen < held
     assert held > 0.8 * unseen
@@ -155,10 +160,9 @@ def test_what_the_other_folds_said_is_no_better_than_what_is_new(fitted):
 def test_arrays_there_and_back_and_another_model():
     features, labels, folds = ground()
     features = features[:, : 3 + CLASSES + 6]
-    model, *_ = fit_table(features, labels, folds, channels=CHANNELS, class_count=CLASSES)
-    inputs = Inputs(CHANNELS, 40, CHANNELS, 1.0, CLASSES, (), ("power_watt", "velocity_mps"), (1.0, 1.0))
-    again = BoostingModel.from_arrays(model.arrays(), inputs).table
-    assert np.array_equal(again.predict(features), model.predict(features))
-    trees = {name: array for name, array in model.arrays().items() if name.startswith("trees")}
+    model, *_ = fit_table(features, labels, folds, INPUTS)
+    again = BoostingModel.from_arrays(model.to_arrays(), INPUTS)
+    assert np.array_equal(again.predict_table(features), model.predict_table(features))
+    trees = {name: array for name, array in model.to_arrays().items() if name.startswith("trees")}
     with pytest.raises(ModelError, match=r"the weights of another model: curve_.* is missing; train the model again"):
-        BoostingModel.from_arrays(trees, inputs)
+        BoostingModel.from_arrays(trees, INPUTS)

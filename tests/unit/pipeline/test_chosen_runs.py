@@ -10,7 +10,6 @@ from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import make_recipe_id
-from tcpipe.pipeline.calls import list_ended_calls
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe
@@ -83,7 +82,9 @@ def test_a_dry_run_counts_and_a_build_is_remembered(store, tmp_path):
     build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
     after = store.scan()
     assert {kind for (kind, _), name in after.names.items() if name not in before.names.values()} == {"calls"}
-    assert [call.counts for call in list_ended_calls(before)] == [{"runs": 3, "samples": made.card.samples}]
+    assert [call.counts for _, call in before.calls if call.exit_code is not None] == [
+        {"runs": 3, "samples": made.card.samples}
+    ]
 
 
 def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_is_not_known_there(
