@@ -19,7 +19,7 @@ from tcpipe.formats.documents import State, make_key
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.object_storage import is_presigned, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
-from tcpipe.formats.runs import LogFailure, find_lineage, find_problems, make_failure
+from tcpipe.formats.runs import LogFailure, LogSnapshot, find_lineage, find_problems, make_failure
 from tcpipe.pipeline.calls import INGEST, RunningCall, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.log_sources import (
@@ -273,7 +273,7 @@ def _record_result(call: RunningCall, task: IngestTask, ended: Ingested, known: 
             failure = LogFailure(content, source.origins, result.problems, __version__, result.findings)
             call.store.put(state, "failed", task.failure_key, failure)
         if result.sha256 and source.files and result.status != "waiting":
-            seen = source.sighting(result.sha256)
+            seen = LogSnapshot(source.origins, source.files, result.sha256)
             if state.find_seen(source.origins) != seen:
                 call.store.put(state, "seen", make_key(find_lineage(source.origins)), seen)
     except StoreError as error:

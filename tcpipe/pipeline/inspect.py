@@ -191,14 +191,13 @@ def _inspect_logs_at(
         raise UsageError(f"{path}: is no map, dataset, run or store, and contains no log")
     if len(logs) == 1:
         return ask(logs[0])
-    return InspectedLogs(path=str(path), logs=tuple(_try_inspect(entry, ask) for entry in logs))
-
-
-def _try_inspect(path: Location, ask: Callable[[Location], InspectedLog]) -> InspectedLog:
-    try:
-        return ask(path)
-    except TcpipeError as error:
-        return InspectedLog(path=format_path(path), problems=error.problems)
+    inspected = list[InspectedLog]()
+    for entry in logs:
+        try:
+            inspected.append(ask(entry))
+        except TcpipeError as error:
+            inspected.append(InspectedLog(path=format_path(entry), problems=error.problems))
+    return InspectedLogs(path=str(path), logs=tuple(inspected))
 
 
 def _inspect_store(store: Store) -> InspectedStore:

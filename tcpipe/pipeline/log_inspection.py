@@ -150,16 +150,15 @@ def inspect_log(
 def _inspect_index(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
     """Return the facts of a topic in the index."""
     mine = {name: role.why for name, role in cast.roles.items() if topic.name in role.topics}
-    played = (", ".join(mine), "; ".join(mine.values())) if mine else None
     if topic.name in cast.transforms:
-        played = "transforms", "places the sensors"
-    role, why = played or (None, cast.left_out.get(topic.name) or topic.problem)
+        mine = {"transforms": "places the sensors"}
+    why = "; ".join(mine.values()) or cast.left_out.get(topic.name) or topic.problem
     return InspectedTopic(
         name=topic.name,
         type=topic.type_name,
         messages=topic.message_count,
         rate_hz=topic.rate_hz and round(topic.rate_hz, 2),
-        role=role,
+        role=", ".join(mine) or None,
         why=why,
     )
 

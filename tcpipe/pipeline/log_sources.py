@@ -84,10 +84,6 @@ class LogSource:
         """Substitute for the log's hash if the log cannot be read: a hash (hex) over names, sizes and times."""
         return digest({"log": self.origins, "files": self.files})
 
-    def sighting(self, sha256: str) -> LogSnapshot:
-        """Return what is remembered of the log as it is now."""
-        return LogSnapshot(self.origins, self.files, sha256)
-
     @property
     def size_bytes(self) -> int:
         """The size of all files."""
