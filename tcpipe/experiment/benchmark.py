@@ -124,7 +124,9 @@ def run_benchmark(
     own_kind: tuple[ModelKind, ...] = () if predictor is None else ("own",)
     evaluations, rows = dict[tuple[str, str], Sequence[Evaluation]](), list[BenchmarkRow]()
     for dataset, name in zip(datasets, names, strict=True):
-        run_of = _read_runs(dataset)
+        data = open_dataset(dataset)
+        columns = ((data[split].column(key).tolist() for key in ("sample_id", "run_id")) for split in SPLITS)
+        run_of = {sample: run for ids, run_ids in columns for sample, run in zip(ids, run_ids, strict=True)}
         for kind in (*kinds, *own_kind):
             own = predictor if kind == "own" else None
             is_random = kind == "own" or find_kind(kind).stops_by_fold
@@ -155,13 +157,6 @@ def _train(dataset: Location, here: Path, config: FitConfig, predictor: str | No
     if result.status == "done" or not where.is_file():
         write_json(where, {"training_s": result.training_times_s.total_s, "device": result.device})
     return float(str(read_json(where)["training_s"]))
-
-
-def _read_runs(dataset: Location) -> Mapping[str, str]:
-    """Return the run of each evaluated sample of a dataset."""
-    data = open_dataset(dataset)
-    columns = [(data[split].column("sample_id"), data[split].column("run_id")) for split in SPLITS]
-    return {sample: run for ids, runs in columns for sample, run in zip(ids.tolist(), runs.tolist(), strict=True)}
 
 
 def _summarize(  # noqa: PLR0917

@@ -20,7 +20,7 @@ from tcpipe.formats.json_files import read_as, write_json
 from tcpipe.learning.baselines import SPLITS, BaselineResult, compare_with_baseline
 from tcpipe.learning.models import load_model
 from tcpipe.learning.network_model import NetworkModel
-from tcpipe.learning.predictions import Measured, Predicted, collect_measured, predict_costs
+from tcpipe.learning.predictions import Predicted, collect_measured, predict_costs
 from tcpipe.learning.predictor import Fitted, Job, Prediction, Samples, find_held_out, predict_samples
 from tcpipe.learning.training import make_training_samples
 
@@ -93,9 +93,14 @@ def compare_networks(model: Path, dataset: Path, place: Path, *, seed: int) -> t
             continue
         said = predict_costs(ours, same.split)
         for name, networks in by_class.items():
+            joule, block_m = np.empty(len(same.split)), data.card.recipe.split.block_m
+            for number, (samples, trained) in networks.items():
+                here = np.flatnonzero((same.class_ids == number) | (name == GRASS))
+                if here.size:
+                    ground = same.split.take(here), same.class_ids[here]
+                    joule[here] = _predict_energy(samples, trained, *ground, ours.card.chord_m)
             if networks:
-                theirs = _predict_by_class(networks, same, chord_m=ours.card.chord_m, of_all=name == GRASS)
-                block_m = data.card.recipe.split.block_m
+                theirs = Predicted({"E": joule}, {})
                 results += compare_with_baseline(name, split, same, said, theirs, block_m=block_m, seed=seed)
     write_json(where, NetworkResults(model=ours.checksum, results=tuple(results)))
     return tuple(results)
@@ -120,16 +125,6 @@ def _fit_by_class(kind: type[NetworkModel], samples: Samples, place: Path, fitte
         name = f"{place.name}_{number}"
         found[number] = own, kind.fit_folds(own, Job(name, place.with_name(f"{name}.checkpoint")))
     return found
-
-
-def _predict_by_class(networks: Networks, part: Measured, *, chord_m: float, of_all: bool) -> Predicted:
-    """Return E of each sample by the network of its class, or of all samples by the only network."""
-    energy = np.empty(len(part.split))
-    for number, (samples, fitted) in networks.items():
-        here = np.flatnonzero((part.class_ids == number) | of_all)
-        if here.size:
-            energy[here] = _predict_energy(samples, fitted, part.split.take(here), part.class_ids[here], chord_m)
-    return Predicted({"E": energy}, {})
 
 
 def _predict_energy(samples: Samples, fitted: Fitted, split: Split, class_id: Ints, chord_m: float) -> Floats:

@@ -264,7 +264,9 @@ def _measure_split(data: Dataset, found: Measured, said: Predicted, spreads: Map
 
 def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig) -> Iterator[AblationRow]:
     """Yield table III, row by row: the model with layers replaced by noise."""
-    for number, letters in enumerate(_list_input_sets(ours)):
+    has = {letter for letter, layer in LETTERS.items() if layer in ours.card.inputs.channels}
+    known = dict.fromkeys(tuple(letter for letter in letters if letter in has) for letters in INPUT_SETS)
+    for number, letters in enumerate(filter(None, known)):
         left = tuple(LETTERS[letter] for letter in letters)
         noise = [channel for channel in ours.card.inputs.channels if channel not in left]
         logger.info("ablation: {%s}", ",".join(letters))
@@ -278,13 +280,6 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig) -> Iterat
             ]
             by_split[name] = {quantity: average_draws(draw[quantity] for draw in draws) for quantity in draws[0]}
         yield AblationRow(letters, by_split)
-
-
-def _list_input_sets(ours: Model) -> list[tuple[str, ...]]:
-    """Return the paper's input sets, as far as the model has their layers."""
-    has = {letter for letter, layer in LETTERS.items() if layer in ours.card.inputs.channels}
-    found = [tuple(letter for letter in letters if letter in has) for letters in INPUT_SETS]
-    return list(dict.fromkeys(letters for letters in found if letters))
 
 
 def _compute_errors(said: Predicted, found: Measured, by: Model) -> dict[str, Errors]:

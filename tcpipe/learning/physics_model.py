@@ -255,16 +255,6 @@ def fit_curves(slope_rad: Floats, class_id: Ints, labels: Floats, *, quantiles: 
     return Curves(knots, pooled, classes, own)
 
 
-def cross_fit_curves(slope_rad: Floats, class_id: Ints, labels: Floats, folds: NDArray[np.generic]) -> Floats:
-    """Return the predictions of linear curves of the other folds, shape (N, outputs)."""
-    out = np.empty_like(labels)
-    for fold in np.unique(folds):
-        held = folds == fold
-        others = fit_curves(slope_rad[~held], class_id[~held], labels[~held])
-        out[held] = others.predict(slope_rad[held], class_id[held])
-    return out
-
-
 def _evaluate_functions(knots_rad: Floats, slope_rad: Floats) -> Floats:
     """Return a curve's basis functions at these slopes, shape (N, J), scaled to order one against rounding."""
     one = np.ones_like(slope_rad)

@@ -193,7 +193,9 @@ class Predictor(Protocol):
     def fit_folds(cls, samples: Samples, job: Job) -> Fitted:
         """Return the model fitted to all samples, and predictions of each by a model of the other folds."""
         del job
-        return cross_fit(cls, samples)
+        began, held_out = time.perf_counter(), cross_predict(cls, samples, samples.folds)
+        whole = cls.fit(samples)
+        return Fitted(whole, held_out, training_times_s=TrainingTimes(time.perf_counter() - began, len(samples)))
 
     def to_arrays(self) -> Arrays:
         """Return all that `from_arrays` needs."""
@@ -224,13 +226,6 @@ def find_kind(name: ModelKind) -> type[Predictor]:
     """Return the class of a kind."""
     module, _, attribute = KINDS[name].partition(":")
     return cast("type[Predictor]", getattr(import_module(module), attribute))
-
-
-def cross_fit(kind: type[Predictor], samples: Samples) -> Fitted:
-    """Fit a model to all samples and, for predictions of each, to the other folds."""
-    began, held_out = time.perf_counter(), cross_predict(kind, samples, samples.folds)
-    whole = kind.fit(samples)
-    return Fitted(whole, held_out, training_times_s=TrainingTimes(time.perf_counter() - began, len(samples)))
 
 
 def cross_predict(kind: type[Predictor], samples: Samples, parts: NDArray[np.generic]) -> Prediction:

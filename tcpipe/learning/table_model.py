@@ -34,7 +34,7 @@ from tcpipe.dataset.extra_features import ExtraFeatures, standardize_features
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm, check_arrays
 from tcpipe.learning.fitting import TrainingTimes
-from tcpipe.learning.physics_model import Curves, cross_fit_curves, fit_curves, list_curve_arrays, read_curves
+from tcpipe.learning.physics_model import Curves, fit_curves, list_curve_arrays, read_curves
 from tcpipe.learning.predictor import Fitted, Inputs, Job, Patches, Prediction, Predictor, Samples, require_folds
 from tcpipe.recipe import TrainConfig
 from tcpipe.terrain.layers import HEIGHT_RANGE_M
@@ -308,7 +308,11 @@ def fit_table(
     inputs, config : what the features are of, and settings of LightGBM.
     """
     slope_rad, class_id = find_slope_and_class(features, inputs.planes, inputs.class_count)
-    curve_labels = cross_fit_curves(slope_rad, class_id, labels, folds)
+    curve_labels = np.empty_like(labels)
+    for fold in np.unique(folds):
+        held = folds == fold
+        others = fit_curves(slope_rad[~held], class_id[~held], labels[~held])
+        curve_labels[held] = others.predict(slope_rad[held], class_id[held])
     trees, held_out, count = grow(features, labels - curve_labels, folds, config)
     model = BoostingModel(fit_curves(slope_rad, class_id, labels), trees, inputs)
     return model, curve_labels + held_out, count

@@ -248,7 +248,15 @@ def make_paper_world() -> World:
         resistance=draw_waves(23, count=10, total=surface["hidden_resistance_share"], wavelength_m=(1.5, 15.0)),
         surface=make_paper_surface(),
     )  # fmt: skip
-    return _stretch_heights(world, about["lowest_m"], about["highest_m"])
+    x, y = site.west_m + np.arange(0.5, site.width_m), site.south_m + np.arange(0.5, site.height_m)
+    heights = world.height_m(x[None, :], y[:, None]) - world.base_m
+    factor = (about["highest_m"] - about["lowest_m"]) / float(heights.max() - heights.min())
+    return replace(
+        world,
+        base_m=about["lowest_m"] - factor * float(heights.min()),
+        hills=tuple(replace(hill, height_m=factor * hill.height_m) for hill in world.hills),
+        waves=tuple(replace(wave, amplitude=factor * wave.amplitude) for wave in world.waves),
+    )
 
 
 def _scatter_places(
@@ -258,20 +266,6 @@ def _scatter_places(
     low = (margin_m, margin_m, *[size_m[0]] * 2, 0.0)
     high = (site.width_m - margin_m, site.height_m - margin_m, *[size_m[1]] * 2, np.pi)
     return rng.uniform(low, high, (count, 5)).tolist()  # type: ignore[no-any-return]
-
-
-def _stretch_heights(world: World, lowest_m: float, highest_m: float) -> World:
-    """Scale and shift the heights so that they span the given range (on a 1 m grid)."""
-    x = world.site.west_m + np.arange(0.5, world.site.width_m)
-    y = world.site.south_m + np.arange(0.5, world.site.height_m)
-    heights = world.height_m(x[None, :], y[:, None]) - world.base_m
-    factor = (highest_m - lowest_m) / float(heights.max() - heights.min())
-    return replace(
-        world,
-        base_m=lowest_m - factor * float(heights.min()),
-        hills=tuple(replace(hill, height_m=factor * hill.height_m) for hill in world.hills),
-        waves=tuple(replace(wave, amplitude=factor * wave.amplitude) for wave in world.waves),
-    )
 
 
 def _make_paper() -> Scenario:

@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -95,7 +95,7 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> ChosenIn
     if not records and not options.without_patches:
         remedy = Remedy("add_map", command="tcpipe add-map NAME --height FILE")
         findings += (make_finding("no-map", Subject("dataset", options.recipe.dataset.name), remedies=[remedy]),)
-    sources = tuple(map(_make_source, runs))
+    sources = tuple(_describe_run(run, RunSource) for run in runs)
     return ChosenInputs(runs, sources, records, maps, made_from, again, chosen, findings)
 
 
@@ -110,7 +110,7 @@ def _describe_inputs(options: BuildOptions, runs: Sequence[StoredRun], maps: Seq
     return DatasetInputs(
         versions={"results": str(RESULTS_VERSION), "tables": TABLES_VERSION},
         recipe=options.recipe,
-        runs={run.run_id: _describe_run(run) for run in runs},
+        runs={run.run_id: _describe_run(run, RunInputs) for run in runs},
         robots=tuple(sorted({run.facts.robot for run in runs})),
         tags=dict(sorted(options.tags.items())),
         maps={record.name: _hash_files(record) for record in maps},
@@ -124,11 +124,15 @@ def _describe_inputs(options: BuildOptions, runs: Sequence[StoredRun], maps: Seq
     )
 
 
-def _describe_run(run: StoredRun) -> RunInputs:
+R = TypeVar("R", RunInputs, RunSource)
+
+
+def _describe_run(run: StoredRun, record: type[R]) -> R:
+    """Return the entry of a run in the card, or in its record of inputs."""
     log, tables = run.facts.log, run.facts.tables
     names = tuple(Path(path).name for path in log.paths)
     segments = tables["segments.parquet"].sha256
-    return convert_record(run.facts, RunInputs, logs=names, sha256=log.sha256, segments_sha256=segments)
+    return convert_record(run.facts, record, logs=names, sha256=log.sha256, segments_sha256=segments)
 
 
 def _refuse_without_segments(runs: Sequence[StoredRun]) -> None:
@@ -188,13 +192,6 @@ def choose_maps(store: Store, state: State, options: BuildOptions) -> tuple[Stor
     return tuple(maps[name] for name in dict.fromkeys(names)) or tuple(maps.values())
 
 
-def _make_source(run: StoredRun) -> RunSource:
-    """Return the card's entry of a run."""
-    log = run.facts.log
-    named = {"sha256": log.sha256, "segments_sha256": run.facts.tables["segments.parquet"].sha256}
-    return convert_record(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
-
-
 _OPTIONS = {
     "robots": "--robot",
     "tags": "--tag",
@@ -237,18 +234,12 @@ def _format_option(change: RecordChange, was: DatasetInputs, now: DatasetInputs)
     field = change.path[0]
     if field == "recipe":
         return f"recipe {change.name}: {format_value(change.was)} in the dataset, {format_value(change.now)} now"
-    values = (_format_field(field, each) for each in (was, now))
-    return f"{_OPTIONS[field]}: {{}} in the dataset, {{}} now".format(*values)
-
-
-def _format_field(field: str, record: DatasetInputs) -> str:
-    """Return the value of an option without file contents: names, presence, the kinds of a region's polygons."""
-    value = getattr(record, field)
-    if field == "region" and value is not None:
-        value = f"{' and '.join(value)} ({digest(value)[:8]})"
+    values = [getattr(record, field) for record in (was, now)]  # without contents of files
+    if field == "region":
+        values = [each and f"{' and '.join(each)} ({digest(each)[:8]})" for each in values]
     elif field == "covariates":
-        value = tuple(value)
-    return format_value(value)
+        values = list(map(tuple, values))
+    return f"{_OPTIONS[field]}: {{}} in the dataset, {{}} now".format(*map(format_value, values))
 
 
 _SAME_TIME_NS = 1_000_000_000

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,18 +101,8 @@ class Spool:
         return self.patch_px**2 * self.layers[layer].stored.itemsize
 
 
-@dataclass(frozen=True, slots=True)
-class _Batch:
-    number: int
-    ranks: NDArray[np.uint64]
-    segments: pa.Table
-    maps: MapPlaces
-    config: SampleConfig
-    gnss_crs: str
-    shifts: Sequence[Shifts]
-    """By map."""
-    spool: Spool
-
+_Batch = tuple[int, NDArray[np.uint64], pa.Table]
+"""Its number, and the ranks and rows of its segments."""
 
 _held = dict[Path, tuple[MapFile, TilePool]]()
 """Maps of this process, while it samples, the last used one last."""
@@ -139,19 +130,20 @@ def sample_all_segments(
     layers = sort_layers(join_layers([source.layers for source in sources]))
     (directory / "pixels").mkdir()
     spool = Spool(directory / "pixels", layers, config.patch_px)
-    each = spool.sample_bytes
-    rows = list(_iterate_batches(segments, max(min(_BATCH_ROWS, _BATCH_BYTES // each), 1)))
+    size = max(min(_BATCH_ROWS, _BATCH_BYTES // spool.sample_bytes), 1)
+    places = [np.floor((to_floats(segments, f"start_{axis}_deg") + 360.0) / _CELL_DEG) for axis in ("lon", "lat")]
+    nearest = np.argsort(compute_morton(*(place.astype(np.int64) for place in places)), kind="stable")
+    rows = [np.sort(nearest[first : first + size]) for first in range(0, len(nearest), size)]
     placed = segments.select(PLACED_SEGMENTS.names())
-    batches = (  # made when a worker can have them: one copy of their segments exists at a time
-        _Batch(index, ranks[at], take_rows(placed, at), maps, config, gnss_crs, shifts, spool)
-        for index, at in enumerate(rows)
-    )
+    batches = ((index, ranks[at], take_rows(placed, at)) for index, at in enumerate(rows))
+    # A batch is made when a worker can have it: one copy of its segments exists at a time.
+    sample = partial(_sample_batch, maps=maps, config=config, gnss_crs=gnss_crs, shifts=shifts, spool=spool)
     lost_by, slots = (make_mapped_array(directory, (segments.num_rows,), kind) for kind in (np.uint32, np.int64))
     counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
     findings: dict[int, tuple[Finding, ...]] = {}
     meter = Meter("sampling", segments.num_rows)
     try:
-        with closing(run_all(_sample_batch, batches, jobs=jobs)) as outcomes:
+        with closing(run_all(sample, batches, jobs=jobs)) as outcomes:
             for outcome in outcomes:
                 part, batch = unwrap_result(outcome), outcome.index
                 meter.add(len(rows[batch]))
@@ -174,23 +166,15 @@ def sample_all_segments(
     return sampled, move_rows_to_file(slots, kept, directory), replace(spool, counts=tuple(counts))
 
 
-def _iterate_batches(segments: pa.Table, size: int) -> Iterator[Ints]:
-    """Yield the rows of each batch, rising."""
-    places = [np.floor((to_floats(segments, f"start_{axis}_deg") + 360.0) / _CELL_DEG) for axis in ("lon", "lat")]
-    order = np.argsort(compute_morton(*(place.astype(np.int64) for place in places)), kind="stable")
-    for first in range(0, len(order), size):
-        yield np.sort(order[first : first + size])
-
-
-def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
+def _sample_batch(
+    batch: _Batch, *, maps: MapPlaces, config: SampleConfig, gnss_crs: str, shifts: Sequence[Shifts], spool: Spool
+) -> Sampled | TcpipeError:
     """Sample one batch; write its pixels to the spool."""
+    number, ranks, segments = batch
     try:
-        sources, pools = zip(*(_reuse_map(*arguments, batch.config) for arguments in batch.maps()), strict=True)
-        sampled = sample_on_maps(
-            batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools, shifts=batch.shifts
-        )
-        order = np.argsort(batch.ranks[sampled.kept], kind="stable")  # that of the dataset
-        return batch.spool.write(batch.number, order, sampled)
+        sources, pools = zip(*(_reuse_map(*arguments, config) for arguments in maps()), strict=True)
+        sampled = sample_on_maps(segments, sources, config, gnss_crs=gnss_crs, pools=pools, shifts=shifts)
+        return spool.write(number, np.argsort(ranks[sampled.kept], kind="stable"), sampled)  # order of the dataset
     except TcpipeError as error:
         return error
 
