@@ -73,6 +73,7 @@ class PhysicsModel:
     physics: PhysicsFit | None = None
     takes_turns: bool = False
     is_time_alone: bool = False
+    dataset: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(name="another", sha256="0" * 64))
 
     @property
     def card(self):

@@ -1,6 +1,7 @@
 """Whole drives against a model: what they took by hand, what cannot be compared, and what was trained on."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 from physics_model import PhysicsModel
@@ -8,6 +9,7 @@ from synthetic_store import box, region_file, small_store
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import ModelError, UsageError
+from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.planning.drives import compute_drive_cost, evaluate_drives, find_drive
 from tcpipe.planning.path_files import choose_map
@@ -44,7 +46,8 @@ def test_a_drive_that_was_held_back_is_summed_where_the_model_knows_the_ground(m
 
 def test_a_drive_that_was_trained_on_is_marked(made, tmp_path):
     store, data, source = made
-    said = evaluate_drives(PhysicsModel(), data, source, ["north", "south"], store=store.root, out=tmp_path / "out")
+    model = PhysicsModel(dataset=SimpleNamespace(name="own", sha256=compute_dataset_checksum(data.card)))
+    said = evaluate_drives(model, data, source, ["north", "south"], store=store.root, out=tmp_path / "out")
     north, south = said.values.drives
     assert not north.held_back
     assert north.near_training_percent > 60.0
@@ -62,6 +65,8 @@ def test_a_drive_that_was_trained_on_is_marked(made, tmp_path):
 
 def test_what_cannot_be_compared_is_told(made):
     store, data, source = made
+    with pytest.raises(ModelError, match=r"physics: was trained on another dataset \(another, 000000000000\)"):
+        evaluate_drives(PhysicsModel(), data, source, ["south"], store=store.root, out="out")
     with pytest.raises(UsageError, match=r"elsewhere.mcap: .* has no run of this log or name; expected the path"):
         find_drive(store, "elsewhere.mcap")
     assert find_drive(store, find_drive(store, "south").name).run_id == "south"  # RUN/RECIPE
