@@ -59,7 +59,7 @@ def test_settings_of_the_recipe_rule_the_trees_and_options_of_the_command_the_ne
     )
     assert done.returncode == 0
     model = load_model(tmp_path / "model")
-    config, texts = model.card.training.config, model.predictor.table.trees
+    config, texts = model.card.training.config, model.predictor.trees
     assert (config.trees, config.tree_leaves, config.epochs) == (3, 2, 9)
     assert all(1 <= text.count("Tree=") <= 3 for text in texts)
     assert {leaves for text in texts for leaves in re.findall(r"num_leaves=(\d+)", text)} == {"2"}
