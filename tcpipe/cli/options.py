@@ -84,6 +84,7 @@ class LonLat(click.ParamType[tuple[float, float]]):
         return lon, lat
 
 
+Command: TypeAlias = Callable[..., Any]
 Option: TypeAlias = Callable[[Any], Any]
 Complete: TypeAlias = Callable[[click.Context, click.Parameter, str], list[str]]
 
@@ -272,7 +273,7 @@ def add_options(cls: type[Any]) -> Option:
         field.name: (field.default, field.metadata["option"]) for field in fields(cls) if "option" in field.metadata
     }
 
-    def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(run: Command) -> Command:
         @click.pass_context
         @wraps(run)
         def command(context: click.Context, /, **values: Any) -> Any:
@@ -294,7 +295,7 @@ store_option = make_click_option("store", "tcpipe-store", options.STORE)
 def add_path_or_run(name: str, metavar: str, *, required: bool) -> Option:
     """Return the decorator of an argument (path or run of the store; default: the store) and of ``--store``."""
 
-    def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(run: Command) -> Command:
         @click.pass_context
         @wraps(run)
         def command(context: click.Context, /, *, store: str, **values: Any) -> Any:
@@ -306,7 +307,7 @@ def add_path_or_run(name: str, metavar: str, *, required: bool) -> Option:
             values[name] = context.params[name] = given or store
             return run(store=store, **values)
 
-        declared: Callable[..., Any] = click.argument(name, type=PATH_OR_RUN, required=required, metavar=metavar)(
+        declared: Command = click.argument(name, type=PATH_OR_RUN, required=required, metavar=metavar)(
             store_option(command)
         )
         return declared
@@ -336,7 +337,7 @@ def add_output(progress: str = "", *, as_values: bool = False) -> Option:
     ``--quiet``.
     """
 
-    def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(run: Command) -> Command:
         @wraps(run)
         def command(*options: Any, as_json: bool, quiet: bool = False, **values: Any) -> Any:
             with show_progress(progress, quiet=quiet) if progress else nullcontext():
@@ -344,7 +345,7 @@ def add_output(progress: str = "", *, as_values: bool = False) -> Option:
             print_result(result.values if as_values and as_json else result, as_json=as_json)
             return getattr(result, "exit_code", 0)
 
-        declared: Callable[..., Any] = json_option(quiet_option(command) if progress else command)
+        declared: Command = json_option(quiet_option(command) if progress else command)
         return declared
 
     return decorate

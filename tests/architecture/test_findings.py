@@ -28,7 +28,6 @@ PRINTERS = {
     "tcpipe/pipeline/proposals.py",
     "tcpipe/pipeline/preflight.py",
     "tcpipe/pipeline/status.py",
-    "tcpipe/pipeline/report.py",
     "tcpipe/planning/drives.py",
     "tcpipe/planning/path_files.py",
     "tcpipe/planning/route_graph.py",
