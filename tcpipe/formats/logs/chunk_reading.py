@@ -59,10 +59,6 @@ class Excerpt:
     offset: Ints
     entries: Entries
 
-    def at(self, chosen: Mask) -> Excerpt:
-        """Return it with some of the messages."""
-        return Excerpt(self.data, self.offset[chosen], self.entries.at(chosen))
-
 
 @dataclass(frozen=True, slots=True)
 class Messages:
@@ -188,16 +184,11 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
         for group in group_chunks(chunk.size for _, chunk in chunks):
             members = chunks[group.start : group.stop]
             sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
-            entries, sound = self.entries([chunk for _, chunk in members], sizes)
+            places, unsound = self.read_indexes([chunk for _, chunk in members])
+            entries, sound = sort_by_place(*places, sizes, least_bytes=self.least_bytes)
+            sound[unsound] = False
             entries = entries.at(np.isin(entries.channel, sorted(wanted)))
             yield from self._read_group(entries, sound, members, wanted)
-
-    def entries(self, chunks: list[AnyChunk], sizes: Ints) -> tuple[Entries, Mask]:
-        """Return the messages of chunks of ``sizes`` bytes by their indexes, and which chunks have a valid index."""
-        (chunk, channel, offset, log_time_ns), unsound = self.read_indexes(chunks)
-        entries, sound = sort_by_place(chunk, channel, offset, log_time_ns, sizes, least_bytes=self.least_bytes)
-        sound[unsound] = False
-        return entries, sound
 
     def _read_group(
         self, entries: Entries, sound: Mask, members: list[tuple[int, AnyChunk]], wanted: frozenset[int]
@@ -233,8 +224,8 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
             except DamageError as error:
                 lost.append(number)
                 self.note_lost(chunks[number], error)
-        found = Excerpt(data, offset, entries)
-        return found.at(~np.isin(entries.chunk, lost)) if lost else found
+        kept = ~np.isin(entries.chunk, lost)
+        return Excerpt(data, offset[kept], entries.at(kept)) if lost else Excerpt(data, offset, entries)
 
     def _copy(self, chunk: AnyChunk, pieces: list[Piece], to: memoryview) -> None:
         """Copy pieces of a chunk; what need not be read as a whole, to check or decompress it, is not."""
