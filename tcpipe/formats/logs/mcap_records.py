@@ -136,20 +136,6 @@ class FieldReader:
         return self.blob().decode(errors="backslashreplace")
 
 
-def parse_schema(content: bytes | memoryview) -> tuple[int, Schema]:
-    """Return a schema and its number."""
-    fields = FieldReader(content)
-    (number,) = fields.take("H")
-    return number, Schema(fields.text(), fields.text(), fields.text())
-
-
-def parse_channel(content: bytes | memoryview) -> tuple[int, ChannelRecord]:
-    """Return a channel and its number."""
-    fields = FieldReader(content)
-    number, schema = fields.take("HH")
-    return number, ChannelRecord(fields.text(), schema, fields.text())
-
-
 def parse_chunk_head(content: bytes | memoryview, offset: int) -> Chunk:
     """Return the chunk whose record begins at ``offset``."""
     fields = FieldReader(content)
@@ -286,11 +272,13 @@ class Contents:
 
     def note(self, opcode: int, content: bytes | memoryview) -> None:
         """Keep a schema or channel; the first of a number counts, and later ones are ignored, however many."""
-        number = int.from_bytes(content[:2], "little")
+        number, fields = int.from_bytes(content[:2], "little"), FieldReader(content)
         if opcode == OP_SCHEMA and number not in self.schemas:
-            self.schemas.setdefault(*parse_schema(content))
+            fields.take("H")
+            self.schemas[number] = Schema(fields.text(), fields.text(), fields.text())
         elif opcode == OP_CHANNEL and number not in self.channels:
-            self.channels.setdefault(*parse_channel(content))
+            _, schema = fields.take("HH")
+            self.channels[number] = ChannelRecord(fields.text(), schema, fields.text())
 
 
 def read_summary(source: ByteSource) -> Contents:
