@@ -184,8 +184,8 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
         for group in group_chunks(chunk.size for _, chunk in chunks):
             members = chunks[group.start : group.stop]
             sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
-            places, unsound = self.read_indexes([chunk for _, chunk in members])
-            entries, sound = sort_by_place(*places, sizes, least_bytes=self.least_bytes)
+            (chunk, channel, offset, at_ns), unsound = self.read_indexes([chunk for _, chunk in members])
+            entries, sound = sort_by_place(chunk, channel, offset, at_ns, sizes, least_bytes=self.least_bytes)
             sound[unsound] = False
             entries = entries.at(np.isin(entries.channel, sorted(wanted)))
             yield from self._read_group(entries, sound, members, wanted)
