@@ -54,7 +54,7 @@ def read_changed(written, data):
 
 
 places = st.floats(0, 1, exclude_max=True)
-few = settings(max_examples=60, deadline=None)
+few = settings(max_examples=30, deadline=None)
 
 
 @few

@@ -95,7 +95,7 @@ ACTIONS = st.one_of(
 )
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30, deadline=None)
 @given(st.lists(ACTIONS, min_size=3, max_size=12))
 def test_what_status_predicts_is_what_ingest_does(row, actions):
     with TemporaryDirectory() as directory, pytest.MonkeyPatch.context() as patch:

@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -62,14 +60,8 @@ def kill(logs, store, monkeypatch, **how):
         ingest([logs], store=store, **{"recipe": Recipe(), **how})
 
 
-def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_it(tmp_path, logs):
-    code = (
-        "import os, signal, sys; from tcpipe.pipeline import ingest; from tcpipe.recipe import Recipe\n"
-        "ingest._iterate_results = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)\n"
-        "ingest.ingest([sys.argv[1]], store=sys.argv[2], recipe=Recipe())"
-    )
-    done = subprocess.run([sys.executable, "-c", code, logs, tmp_path / "store"], check=False)
-    assert done.returncode == -9
+def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_it(tmp_path, logs, monkeypatch):
+    kill(logs, tmp_path / "store", monkeypatch)
     found = CliRunner().invoke(cli, ["status", str(tmp_path / "store"), "--json"], standalone_mode=False)
     assert found.return_value == 3
     (finding,) = json.loads(found.stdout)["problems"]

@@ -8,12 +8,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 import rasterio
-from click.testing import CliRunner
 from map_worlds import World, write_tif
 from rasterio import Affine
 from stored_files import map_path, read_files
 
-from tcpipe.cli import cli
 from tcpipe.errors import MapError, StoreError, UsageError
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.pipeline.maps import add_map
@@ -168,23 +166,6 @@ def test_everything_wrong_with_the_files_is_said_at_once(site, store, tmp_path):
         "no.tif: there is no such file",
         "no.csv: there is no such file",
     ]
-
-
-def test_the_command_prints_a_few_plain_lines(site, store):
-    arguments = ["add-map", "garden", "--store", str(store), "--quiet"]
-    for role, path in site.items():
-        arguments += [f"--{role}", str(path)]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    lines = result.stdout.splitlines()
-    assert result.exit_code == 0
-    assert lines[:2] == [
-        f"{map_path(store, 'garden')} (quick look: garden.png)",
-        "60 x 60 px of 0.2 m (12 x 12 m) in EPSG:32633",
-    ]
-    assert lines[2].startswith("height   100 % covered, from height.tif: 6")
-    assert lines[4].startswith("terrain  100 % covered, from terrain.tif: ")
-    assert lines[5].endswith("[classes-assumed]")
-    assert len(lines) == 6
 
 
 def test_a_quick_look_shows_the_orthophoto_and_is_restored(site, store):

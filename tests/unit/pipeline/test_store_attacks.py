@@ -15,8 +15,8 @@ from tcpipe.pipeline import prune
 DRAWS_DATASET_PAGES = True  # no dataset is built here
 
 IS_WHOLE = bool(os.environ.get("TCPIPE_TEST_OPERATIONS"))
-SPARSE = 4
-"""`make test` chooses every fourth request that writes, and those that write a document that names payload."""
+SPARSE = 8
+"""`make test` chooses every eighth request that writes, and those that write a document that names payload."""
 
 
 @pytest.fixture(scope="module")

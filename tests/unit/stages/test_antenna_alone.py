@@ -103,6 +103,13 @@ def test_an_antenna_alone_does_not_show_reversing_which_is_a_note(alone, truth):
     assert "sensor-not-placed" not in {code for code, _ in codes_of(alone, "warning")}
 
 
+def test_an_imu_too_slow_to_bridge_fixes_leaves_an_antenna_alone(truth):
+    found = fuse(record(truth, imu=True, imu_hz=1.0)).info.report.findings
+    codes = [each.code for each in found]
+    assert codes.count("imu-too-slow") == codes.count("track-of-antenna") == codes.count("direction-assumed") == 1
+    assert "sensor-not-placed" not in codes
+
+
 def test_a_command_shows_that_a_robot_with_an_antenna_alone_reverses(truth):
     track = fuse(record(truth, commanded=True))
     dropped, backward = reversing_of(track, truth)
