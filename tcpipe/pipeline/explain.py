@@ -179,8 +179,8 @@ def _find_run(store: Store, directory: Path, card: DatasetCard, sample: Row) -> 
     found = store.find_runs(f"{sample['run_id']}/{recipe_id}")
     if not found:
         raise DatasetError(
-            f"{store.root}: no run {sample['run_id']} of recipe {recipe_id}, from which {directory} was built; "
-            "name the store of that build with --store"
+            f"{store.root}: run {sample['run_id']} of recipe {recipe_id} is not in this store; "
+            f"name the store from which {directory} was built with --store"
         )
     return found[0]
 
