@@ -13,7 +13,9 @@ from tcpipe.simulation.route import Wander
 from tcpipe.simulation.site_files import simulate_messages
 
 NOISE = ("gnss_noise", "wheel_noise", "imu_noise", "visual_noise", "power_noise", "gnss_lever_arm", "imu_mounting")
-LENGTH_M = 35.0
+LENGTH_M = 50.0
+SHORT_M = 35.0
+"""Length of drives whose labels are tested [m]; pages show a longer one."""
 GYROSCOPE, ACCELEROMETER, TWIST = (
     tuple(f"{name}.{axis}" for axis in "xyz")
     for name in ("angular_velocity", "linear_acceleration", "twist.twist.linear")
@@ -21,9 +23,9 @@ GYROSCOPE, ACCELEROMETER, TWIST = (
 ODOMETRY = ("twist.twist.linear.x", "twist.twist.angular.z", "pose.pose.position.x", "pose.pose.position.y")
 
 
-def simulate_drive(*faults: str) -> Drive:
+def simulate_drive(*faults: str, length_m: float = LENGTH_M) -> Drive:
     demo = find_scenario("demo")
-    spec = replace(demo.drives[0], plan=Wander(LENGTH_M, (110.0, 30.0)), faults=Faults.only(*NOISE, *faults))
+    spec = replace(demo.drives[0], plan=Wander(length_m, (110.0, 30.0)), faults=Faults.only(*NOISE, *faults))
     truth, messages = simulate_messages(replace(demo, drives=(spec,)), seed=5)
     return Drive(truth, tuple(messages))
 
@@ -77,10 +79,14 @@ CODES = {
 }
 
 
-def make_drives(*names: str) -> dict[str, Drive]:
+def make_drives(*names: str, length_m: float = LENGTH_M) -> dict[str, Drive]:
     """Return the drive of each fault that is named."""
-    drive = simulate_drive()
-    late = {name: simulate_drive(name.replace("late", "clock_offset")) for name in names if name.endswith("late")}
+    drive = simulate_drive(length_m=length_m)
+    late = {
+        name: simulate_drive(name.replace("late", "clock_offset"), length_m=length_m)
+        for name in names
+        if name.endswith("late")
+    }
     of_one = {
         "no_power": drive.without("power"),
         "no_gnss": drive.without("gnss"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from changed_drives import energy_ratio
-from faulty_drives import scale, simulate_drive
+from faulty_drives import SHORT_M, scale, simulate_drive
 from suggested_recipes import recipe_that_follows
 
 from tcpipe.formats.finding_lines import list_verdict
@@ -16,7 +16,7 @@ CODE = "power-implausible"
 
 @pytest.fixture(scope="module")
 def drive():
-    return simulate_drive()
+    return simulate_drive(length_m=SHORT_M)
 
 
 def ingest_drive(drive, folder, recipe=None):

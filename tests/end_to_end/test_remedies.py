@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from faulty_drives import make_drives
+from faulty_drives import SHORT_M, make_drives
 from suggested_recipes import recipe_that_follows
 
 from tcpipe.formats.logs.writing import write_mcap
@@ -21,7 +21,7 @@ FAULTS = ("imu_late", "gyroscope_mirrored", "wheels_too_fast", "fixes_jump", "cu
 
 @pytest.fixture(scope="module")
 def drives():
-    return make_drives(*FAULTS)
+    return make_drives(*FAULTS, length_m=SHORT_M)
 
 
 def find_wrong_and_sure(drive, result, store):
