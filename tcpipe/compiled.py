@@ -12,7 +12,6 @@ import logging
 import os
 import shutil
 import stat
-import sys
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -21,7 +20,6 @@ from typing import Any, TypeVar
 
 import numba
 from numba.core import event
-from numba.core.cpu import CPUContext
 from numba.core.dispatcher import Dispatcher
 from numba.extending import overload
 from numba.np import arrayobj
@@ -48,29 +46,6 @@ class _Announce(event.Listener):  # type: ignore[misc]
 
 
 event.register("numba:compile", _Announce())
-
-
-_BLAS = "scipy.linalg.cython_blas"
-_load = CPUContext.load_additional_registries
-
-
-def _load_without_blas(context: CPUContext) -> None:
-    """Load what numba needs, in the command line without scipy's linear algebra, whose import takes 0.2 s.
-
-    Numba would reject a kernel that multiplies matrices. Programs that import tcpipe may have such kernels, so they
-    load it.
-    """
-    if "tcpipe.cli" not in sys.modules or _BLAS in sys.modules:
-        _load(context)
-        return
-    sys.modules[_BLAS] = None  # type: ignore[assignment]
-    try:
-        _load(context)
-    finally:
-        del sys.modules[_BLAS]
-
-
-CPUContext.load_additional_registries = _load_without_blas
 
 
 def _raise_shape_error(source: _Shape, target: _Shape) -> None:  # noqa: ARG001  numba calls it with both shapes

@@ -24,9 +24,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from tcpipe.arrays import Floats, Ints, Mask
-from tcpipe.robust import estimate_robust_std, solve_non_negative
+from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.facts import PhysicsFit, PhysicsScore, PhysicsTerm
 
 FEWEST = 20  # segments for a fit, and for coefficients of a class
@@ -262,7 +263,7 @@ def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], idle_wat
 def _fit_non_negative(made: Floats, target: Floats) -> Floats:
     """Return what fits best with no size below zero: mostly no bound holds, and the plain solution is it."""
     plain = np.asarray(np.linalg.lstsq(made, target, rcond=None)[0], np.float64)
-    return plain if (plain >= 0.0).all() else solve_non_negative(made, target)
+    return plain if (plain >= 0.0).all() else nnls(made, target)[0]
 
 
 def _estimate_covariance(

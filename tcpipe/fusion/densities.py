@@ -11,13 +11,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from tcpipe.arrays import Floats
 from tcpipe.fusion.level_motion import KNOT_S, get_turn_rates
 from tcpipe.fusion.measurements import IMU, NO_TRUST, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
-from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std, solve_non_negative
+from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +241,7 @@ class _Fit:
             logarithm = np.log(levels) + np.minimum(1.0 / (_REDUNDANCY * counts), 0.5)
             target = np.concatenate(((1.0 + logarithm) * weight, self._mean / std))
             # Solved in units of the prior, so that rounding does not decide.
-            fitted = solve_non_negative(matrix * std, target) * std
+            fitted = nnls(matrix * std, target)[0] * std
             self._variances = 0.5 * (self._variances + fitted)
             self._covariance = np.linalg.inv(np.einsum("mi,mj->ij", matrix, matrix))
 

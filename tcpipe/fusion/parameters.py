@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri
 
 from tcpipe.arrays import Floats
 from tcpipe.fusion import state
@@ -17,7 +18,6 @@ from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory
 from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements, Positions
 from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, is_length_observable, turn_scale_std
-from tcpipe.fusion.signals import find_chi_square_threshold
 from tcpipe.fusion.state import Error, Kind, Mode
 from tcpipe.fusion.ticks import Ticks
 from tcpipe.geometry.rotation import matrix_from_quat
@@ -206,7 +206,7 @@ def make_model(
         depends[row, : len(places)] = places
     gates = np.full(state.KINDS, np.inf)
     for kind in set(range(state.KINDS)) - {Kind.SIDEWAYS, Kind.LEVEL}:
-        gates[kind] = find_chi_square_threshold(state.SIZES[kind], gate_probability)
+        gates[kind] = chdtri(state.SIZES[kind], 1.0 - gate_probability)
     scales = np.full(state.KINDS, -1, np.int64)
     scales[Kind.WHEELS] = position.get(Error.WHEEL_SCALE, -1)
     scales[Kind.VISUAL] = position.get(Error.VISUAL_SCALE, -1)

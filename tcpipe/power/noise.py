@@ -17,11 +17,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
 
 from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.power.rails import Rail, SampledSignal, interpolate_rail, sum_power
 from tcpipe.power.sampling import estimate_smoothing_variance
-from tcpipe.robust import solve_non_negative
 from tcpipe.tables.facts import Smoothing
 
 _NS = 1e-9
@@ -208,10 +208,10 @@ def fit_signal_model(signal: SampledSignal, steady: Mask, still: Mask, *, averag
     error = _estimate_error_variance(signal, still, period_s, averaged=averaged)
     if error is None:
         columns = np.vstack((np.ones(len(spacing)), shown[2:]))  # faster processes look like independent errors
-        error, *size[2:] = solve_non_negative((columns * weight).T, seen * weight).tolist()
+        error, *size[2:] = nnls((columns * weight).T, seen * weight)[0].tolist()
     else:
         error = min(error, float(seen.min()))
-        size = solve_non_negative((shown * weight).T, (seen - error) * weight)
+        size = nnls((shown * weight).T, (seen - error) * weight)[0]
     slope_variance = float(size @ _SLOPES) / period_s**2
     return SignalModel(error, size @ _PROCESSES, period_s * _TAU, float(size @ shown[:, 0]), slope_variance)
 

@@ -2,16 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.special import chdtri
 
 from tcpipe.fusion.signals import (
     compute_median_period_ns,
     compute_seconds,
     compute_slopes,
     estimate_white_noise,
-    find_chi_square_threshold,
     hold_last,
     integrate_signal,
     is_in_gap,
@@ -66,13 +62,6 @@ def test_white_noise_is_told_from_motion():
     noise = 0.05 * np.random.default_rng(1).normal(size=(4000, 3))
     assert estimate_white_noise(noise + np.sin(t)[:, None]) == pytest.approx(0.05, rel=0.05)
     assert estimate_white_noise(noise[:2]) == 0.0
-
-
-@given(st.integers(1, 9), st.floats(1e-3, 1.0 - 1e-9))
-def test_as_scipy(freedom, probability):
-    assert find_chi_square_threshold(freedom, probability) == pytest.approx(
-        chdtri(freedom, 1.0 - probability), rel=1e-7
-    )
 
 
 def test_the_integral_of_a_ramp_is_exact_at_any_stamp():
