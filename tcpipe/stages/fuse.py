@@ -74,12 +74,13 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
     # 3. Excluded sensors, and what the run shows of the others.
     summary = make_fuse_facts(sections, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
     exclusions = find_exclusions(sections)
+    is_antenna_alone = any(section.measurements.is_antenna_alone for section in sections)
     findings = (
         *find_fuse_findings(sections, summary, run=run),
         *(replace(finding, severity="warning") for finding in failures if finding.severity == "error"),
         *exclusions,
         *find_parameter_findings(sections, summary, streams),
-        *([make_finding("direction-assumed", Subject("role", GNSS))] if fused.is_forward_assumed else []),
+        *([make_finding("direction-assumed", Subject("role", GNSS))] if is_antenna_alone else []),
         *find_offsets(sections, streams),
         *sections[0].cuts.values(),
     )

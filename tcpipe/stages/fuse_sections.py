@@ -24,9 +24,9 @@ from tcpipe.fusion.measurements import (
     cut_sections,
     make_track_stamps,
 )
-from tcpipe.fusion.signals import Signal, compute_median_period_ns, compute_seconds, hold_last, is_covered
+from tcpipe.fusion.signals import Signal, compute_seconds, hold_last, is_covered
 from tcpipe.geometry.datum import geodetic_from_enu
-from tcpipe.geometry.rotation import matrix_from_quat, multiply, rpy_from_matrix
+from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import Section, rank_sections
@@ -38,13 +38,12 @@ from tcpipe.tables.levels import REJECTIONS, Streams
 
 @dataclass(slots=True)
 class Fused:
-    """Trajectory, facts and columns of every section; time without track [s]; whether a direction is assumed."""
+    """Trajectory, facts and columns of every section; time without track [s]."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
     columns: list[Mapping[str, Signal]] = field(default_factory=list)
     skipped_s: float = 0.0
-    is_forward_assumed: bool = False
 
     def append(self, other: Fused) -> None:
         """Append the track of a later section."""
@@ -67,10 +66,6 @@ def fuse_section(section: Section, streams: Streams, config: FuseConfig, last: T
             initial = replace(initial, position_enu_m=last.position_enu_m[-1], quat_xyzw=last.quat_xyzw[-1])
         # 2. Filter and smoother.
         trajectory = _estimate(part, initial, output_ns, config)
-        if m.gnss is not None and m.is_antenna_alone:
-            commanded_mps = make_command_columns(section.command, output_ns)["commanded_velocity_mps"]
-            trajectory = assume_forward(trajectory, m.gnss.lever_arm_m, commanded_mps)
-            fused.is_forward_assumed |= not np.isfinite(commanded_mps).any()
         fused.found.append(trajectory)
         fused.facts.append(make_section_facts(part, initial, trajectory))
         # 3. Other quantities at the track's stamps.
@@ -87,36 +82,6 @@ def _estimate(
     else:
         run = run_error_state
     return run(section.measurements, initial, output_ns=output_ns, gate_probability=config.gate_probability)
-
-
-def assume_forward(
-    found: Trajectory, arm_m: tuple[float, float, float], commanded_mps: NDArray[np.float64]
-) -> Trajectory:
-    """Return the trajectory of a lone antenna at ``arm_m`` [m] in base_link with a robot that drives forward.
-
-    It drives backward where ``commanded_mps`` [m/s], shape (N,), NaN where unknown, is negative. A robot that the
-    estimate drives the other way is turned by half a turn about its z axis; the antenna keeps its place.
-    """
-    rotation, velocity = matrix_from_quat(found.quat_xyzw), found.velocity_enu_mps
-    ahead_mps = np.sum(rotation[:, :, 0] * velocity, axis=1) * np.where(commanded_mps < 0.0, -1.0, 1.0)
-    # Rows up to the next change of sign are one drive; those below 0.2 m, which may be noise, keep the direction of the
-    # one before.
-    drive = np.cumsum(np.diff(np.sign(ahead_mps), prepend=0.0) != 0.0)
-    driven_m = np.bincount(drive, np.abs(ahead_mps)) * compute_median_period_ns(found.stamp_ns) * 1e-9
-    shown = np.flatnonzero(driven_m[drive] > 0.2)
-    if not shown.size:
-        return found
-    last = np.searchsorted(shown, np.arange(drive.size), "right") - 1
-    turned = (ahead_mps[shown[np.maximum(last, 0)]] < 0.0)[:, None]
-    moved_m = np.array([2.0 * arm_m[0], 2.0 * arm_m[1], 0.0])
-    moved_mps = np.cross(found.angular_velocity_radps, moved_m)
-    return replace(
-        found,
-        position_enu_m=found.position_enu_m + turned * (rotation @ moved_m),
-        quat_xyzw=np.where(turned, multiply(found.quat_xyzw, np.array([0.0, 0.0, 1.0, 0.0])), found.quat_xyzw),
-        velocity_enu_mps=velocity + turned * np.einsum("nij,nj->ni", rotation, moved_mps),
-        angular_velocity_radps=found.angular_velocity_radps * np.where(turned, [-1.0, -1.0, 1.0], 1.0),
-    )
 
 
 def _make_columns(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from unit.fusion import drive
-from unit.stages.test_fuse import SITE, filled, sensor, streams_of
+from unit.stages.test_fuse import SITE, sensor, streams_of
 
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.recipe import FuseConfig, MaskConfig
@@ -14,7 +14,6 @@ from tcpipe.stages.mask import mask_track
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import StageReport, Subject, make_finding
-from tcpipe.tables.levels import COMMAND
 
 SECONDS, REVERSE_S = 60.0, 8.0
 
@@ -25,24 +24,19 @@ def truth():
     return drive.make_drive(SECONDS, reverse_s=REVERSE_S)
 
 
-def record(truth, *, imu_hz=200.0, commanded=False, **sensors):
+def record(truth, *, imu_hz=200.0, **sensors):
     """Return the streams of a drive with fixes of an antenna that nothing places, and with the sensors asked for."""
     carried = {"wheels": False, "visual": False, "imu": False} | sensors
     streams = streams_of(drive.measure(truth, 1, imu_hz=imu_hz, **carried))
-    tables, sensors = dict(streams.tables), dict(streams.sensors)
+    sensors = dict(streams.sensors)
     unplaced = [role for role in ("gnss", "imu") if role in sensors]
     sensors["gnss"] = replace(sensor(), placed_by="assumed")
-    if commanded:
-        stamp_ns = drive.ns(np.arange(0.0, SECONDS, 0.1))
-        speed = np.round(np.interp((stamp_ns - drive.ZERO_NS) * 1e-9, truth.t, truth.forward), 1)
-        tables["command"] = filled(COMMAND, stamp_ns, forward_velocity_mps=speed, yaw_rate_radps=0.0 * speed)
-        sensors["command"] = sensor()
     findings = tuple(
         make_finding("sensor-not-placed", Subject("role", role), names={"frame": role, "topic": "/topic"})
         for role in unplaced
     )
     report = StageReport(findings, streams.report.facts)
-    return replace(streams, tables=tables, sensors=sensors, report=report)
+    return replace(streams, sensors=sensors, report=report)
 
 
 def fuse(streams):
@@ -108,13 +102,6 @@ def test_an_imu_too_slow_to_bridge_fixes_leaves_an_antenna_alone(truth):
     codes = [each.code for each in found]
     assert codes.count("imu-too-slow") == codes.count("track-of-antenna") == codes.count("direction-assumed") == 1
     assert "sensor-not-placed" not in codes
-
-
-def test_a_command_shows_that_a_robot_with_an_antenna_alone_reverses(truth):
-    track = fuse(record(truth, commanded=True))
-    dropped, backward = reversing_of(track, truth)
-    assert np.mean(dropped == backward) > 0.97
-    assert ("direction-assumed", "gnss") not in codes_of(track, "note")
 
 
 @pytest.mark.parametrize("sensors", [{"wheels": True}, {"imu": True, "wheels": True}], ids=["wheels", "IMU, wheels"])
