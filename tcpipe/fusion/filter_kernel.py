@@ -94,10 +94,8 @@ class FilterModel(NamedTuple):
         errors on which it depends, (11, n), of which the first ``counts`` (11,) are used.
     kept, noise : share that stays of each error over a tick, and variance added, (n,).
     gates : largest squared normalised innovation by kind; infinite: no gate.
-    patience : by kind, rejections in a row, and seconds since the last accepted measurement, after which one is
-        accepted; the seconds where no other sensor of motion is heard; (9, 3).
+    patience_s : by kind, time since the last accepted measurement after which one is accepted [s], (9,).
     mount : place of the IMU's mounting in ``active``; -1: known exactly.
-    scales : by kind, the place in ``active`` of the sensor's own scale; -1: none.
     events : changes of errors: (tick, place in ``active``, whether the error is another one now); (e, 3).
     sizes, shifts : variance that each event adds, and by how much it changes the error, (e,).
     """
@@ -108,9 +106,8 @@ class FilterModel(NamedTuple):
     kept: Vector
     noise: Vector
     gates: Vector
-    patience: Matrix
+    patience_s: Vector
     mount: int
-    scales: Indices
     events: NDArray[np.int64]
     sizes: Vector
     shifts: Vector
@@ -439,8 +436,8 @@ def _correct(x: Vector, P: Matrix, active: Indices, size: int, gain: Any, K: Mat
 
 
 @compile_kernel
-def _widen(kind: int, P: Matrix, y: Vector, size: int, scale: int) -> None:
-    """Widen P after a long rejection of a sensor, so that it counts again: the state, or the ``scale`` (-1: none)."""
+def _widen(kind: int, P: Matrix, y: Vector, size: int) -> None:
+    """Widen P after a long rejection of a sensor, so that it counts again."""
     if kind == Kind.FIX:
         P[Error.THETA + 2, Error.THETA + 2] += 0.1**2
         for i in range(3):
@@ -449,8 +446,6 @@ def _widen(kind: int, P: Matrix, y: Vector, size: int, scale: int) -> None:
     elif kind == Kind.ATTITUDE:
         for i in range(3):
             P[Error.THETA + i, Error.THETA + i] += y[i] * y[i]
-    elif scale >= 0:
-        P[scale, scale] += 0.1**2
     else:
         for i in range(size):
             P[Error.U + i, Error.U + i] += y[i] * y[i]
@@ -518,13 +513,9 @@ def filter_ticks(
             if not nis <= model.gates[kind]:
                 verdict = GateVerdict.REJECTED
                 waits[kind, 0] += 1.0
-                is_alone = True
-                for other in (Kind.WHEELS, Kind.VISUAL, Kind.FIX):
-                    is_alone = is_alone and (other == kind or waits[other, 1] > 2.0)  # s
-                patience_s = model.patience[kind, 2 if is_alone else 1]
-                if waits[kind, 0] >= model.patience[kind, 0] and waits[kind, 1] >= patience_s:
+                if waits[kind, 0] >= 5.0 and waits[kind, 1] >= model.patience_s[kind]:
                     verdict = GateVerdict.RESET
-                    _widen(kind, P, y, size, -1 if is_alone else model.scales[kind])
+                    _widen(kind, P, y, size)
                     _compare(k, kind, inputs, model, x, P, acceleration, gain, room)
             tests.verdict[k, kind] = verdict
             if verdict == GateVerdict.REJECTED:

@@ -60,11 +60,6 @@ PARAMETERS = (
 """What does not come from the run itself; the scales of odometries and the errors of fixes do, see `make_priors`."""
 FIX_AXES = np.array([1.0, 1.0, 1.7])
 """Ratio of lasting errors of fixes east, north and up [1]: no satellite is below."""
-_PATIENCE: Mapping[int, tuple[float, float, float]] = {
-    Kind.FIX: (5.0, 15.0, 5.0),
-    Kind.WHEELS: (5.0, 5.0, 0.3),
-    Kind.VISUAL: (5.0, 5.0, 0.3),
-}
 _MINUTE_S = 60.0
 
 
@@ -207,9 +202,9 @@ def make_model(
     gates = np.full(state.KINDS, np.inf)
     for kind in set(range(state.KINDS)) - {Kind.SIDEWAYS, Kind.LEVEL}:
         gates[kind] = chdtri(state.SIZES[kind], 1.0 - gate_probability)
-    scales = np.full(state.KINDS, -1, np.int64)
-    scales[Kind.WHEELS] = position.get(Error.WHEEL_SCALE, -1)
-    scales[Kind.VISUAL] = position.get(Error.VISUAL_SCALE, -1)
+    patience_s = np.full(state.KINDS, np.inf)
+    if not possible:
+        patience_s[[Kind.FIX, Kind.ATTITUDE]] = 1.0 if m.imu is None and m.visual is None else 5.0
     return FilterModel(
         active=active,
         depends=depends,
@@ -217,25 +212,12 @@ def make_model(
         kept=kept[active],
         noise=np.square(walk[active]) * period_s + np.square(std[active]) * (1.0 - kept[active] ** 2),
         gates=gates,
-        patience=_find_patience(m, follows=not possible),
+        patience_s=patience_s,
         mount=position.get(Error.MOUNT, -1),
-        scales=scales,
         events=np.array([(e.tick, position[e.place], e.is_new) for e in events], np.int64).reshape(-1, 3),
         sizes=np.array([(std[e.place] if e.is_new else e.std) ** 2 for e in events], np.float64),
         shifts=np.array([e.mean for e in events], np.float64),
     )
-
-
-def _find_patience(m: Measurements, *, follows: bool) -> Floats:
-    patience = np.array([_PATIENCE.get(kind, (np.inf,) * 3) for kind in range(state.KINDS)])
-    if m.visual is None or m.imu is None:  # what is left cannot overrule fixes for long
-        patience[Kind.FIX, 1] = _PATIENCE[Kind.FIX][2]
-    if m.imu is None and m.visual is None:  # wheels that dig in must not overrule fixes
-        patience[Kind.FIX, 1:] = 1.0
-    if not follows:
-        patience[Kind.FIX] = np.inf
-    patience[Kind.ATTITUDE] = patience[Kind.FIX]
-    return patience
 
 
 def make_start(initial: InitialState, std: Floats, arm_m: Sequence[float]) -> Memory:

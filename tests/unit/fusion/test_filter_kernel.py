@@ -390,7 +390,7 @@ def filter_stationary(kind, displace, noise):
     inputs.value[:, kind], inputs.variance[:, kind] = 0.0, 1e-4
     inputs.attitude[:] = 0.0
     displace(inputs)
-    model.patience[kind] = 5.0, 2.0, 2.0
+    model.patience_s[kind] = 2.0
     x = np.zeros(state.NX)
     x[:9] = np.eye(3).ravel()
     tests, states = make_tests(120), np.zeros((120, state.NX))
