@@ -125,13 +125,13 @@ def change_std_m(noise: SensorNoise, time_s: float) -> float:
 def simulate(seeds: list[int], length_m: float, only: str) -> None:
     drives = {seed: measure(seed, length_m) for seed in seeds}
     wide = [f"{axis} {after_s:.0f} s" for axis in ("plane", "up") for after_s in AFTER_S]
-    print(f"{'noise':15} {'sensors':10}", *(f"{name:>16}" for name in wide), " false mm  told  CPU s")
+    print(f"{'noise':15} {'sensors':10}", *(f"{name:>16}" for name in wide), " false mm  CPU s")
     inside = []
     for name, family in FAMILIES.items():
         for which, choose in SENSORS.items():
             if only not in f"{name}, {which}":
                 continue
-            ratios, false_mm, told, cpu_s = [], [], [], []
+            ratios, false_mm, cpu_s = [], [], []
             for seed, drive in drives.items():
                 measurements = choose(add_noise(drive, family, seed))
                 start = time.process_time()
@@ -146,7 +146,6 @@ def simulate(seeds: list[int], length_m: float, only: str) -> None:
                     ]
                 )
                 false_mm.append(1e3 * np.sqrt(model.horizontal.correlated.variance))
-                told.append(model.horizontal.correlated.data_share)
             found = np.array(ratios)
             inside.append((found[:, :2] > 0.85) & (found[:, :2] < 1.35))
             columns = (
@@ -154,7 +153,7 @@ def simulate(seeds: list[int], length_m: float, only: str) -> None:
             )
             false = f"{max(false_mm):8.1f}" if not family.processes else f"{'':8}"
             row = " ".join(f"{column:>16}" for column in columns)
-            print(f"{name:15} {which:10} {row} {false}  {min(told):.2f}  {max(cpu_s):.2f}", flush=True)
+            print(f"{name:15} {which:10} {row} {false}  {max(cpu_s):.2f}", flush=True)
     print(f"in the plane, {np.mean(inside):.0%} of ratios between 0.85 and 1.35")
 
 
@@ -166,12 +165,12 @@ def describe(model: NoiseModel) -> Iterator[str]:
             )
             yield (
                 f"  fixes, {axis}: claimed {claimed:.1f} mm, white {white:.1f} mm, correlated {slow:.1f} mm over "
-                f"{noise.correlated.time_s:.0f} s (told {noise.correlated.data_share:.2f})"
+                f"{noise.correlated.time_s:.0f} s"
             )
     for role, each in model.odometries.items():
         yield (
-            f"  {role}: {1e3 * np.sqrt(each.white):.1f} mm after 1 s (told {each.white_data_share:.2f}), scale "
-            f"{100 * np.sqrt(each.correlated.variance):.2f} % over {each.correlated.time_s:.0f} s (told {each.correlated.data_share:.2f})"
+            f"  {role}: {1e3 * np.sqrt(each.white):.1f} mm after 1 s, scale "
+            f"{100 * np.sqrt(each.correlated.variance):.2f} % over {each.correlated.time_s:.0f} s"
         )
     for role, turn in model.turns.items():
         yield f"  turns, {role}: {1e3 * np.sqrt(turn.white):.2f} mrad after 1 s"

@@ -26,13 +26,10 @@ class GaussMarkov:
     """A stationary process with covariance ``variance * exp(-|dt| / time_s)``; variance in the squared unit.
 
     Without a time white noise, by its density.
-
-    ``data_share``: share of the variance that the data determine; the rest is the prior's.
     """
 
     variance: float
     time_s: float = 0.0
-    data_share: float = 0.0
 
     def difference_variance(self, time_s: Floats) -> Floats:
         """Return the variance of the change over each time difference [s]: the structure function."""
@@ -53,13 +50,11 @@ class SensorNoise:
         bias around its mean [rad/s].
     claimed_m2 : median variance of the fixes of a run; both parts are those of a fix of this claim, and in proportion
     to it.
-    white_data_share : share of ``white`` that the data determine: 0 is only the prior, 1 only the data.
     """
 
     white: float
     correlated: GaussMarkov
     claimed_m2: float = 0.0
-    white_data_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +111,6 @@ _FLOOR_M, _FLOOR_SHARE = 0.002, 0.0025
 _CENTIMETRES_M2 = 0.1**2  # fixes that claim less are RTK's
 _SUMMARY_S = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 40.0])  # where one process stands for a sum
 _SUMMARY_TAU_S = np.geomspace(2.0, 100.0, 40)
-_SHARE_S = 10.0  # time difference [s] at which the data's share of a process is computed
 _ROUNDS = 16  # rounds of the fit [1]; medians in the first half, means below the gate in the second
 _GATE = 9.0  # gate of z² [1], 3σ
 _TRUNCATED = 0.9733  # mean of a χ² variate of one degree of freedom below the gate [1]
@@ -125,7 +119,6 @@ _FEW_WINDOWS, _FEW_WINDOWS_S = 4.0, 20.0  # longer windows by this factor [1] en
 _PROCESS_MARGIN = 0.6  # standard deviations of a fitted process [1] by which the filter's is larger
 _REDUNDANCY = 2.0  # windows per independent one [1]: other lengths and axes share their errors
 _FEWEST = 8  # fewest windows of a cell [1]
-DETERMINED = 0.5  # share of a density by the data [1]; below it the larger of fit and prior counts
 _MAX_VARIANCE_RATIO = 1.5  # shown over stated variance of fixes without claims [1]; above it the shown one counts
 _CODE_PHASE_M2 = 1.5**2  # variance of each axis [m²]; GPS Standard Positioning Service, Performance Standard 2020
 _PROCESS_STD = 0.6  # 1σ of the share of the claim [1] that one correlation time has
@@ -213,14 +206,6 @@ class _Fit:
         self._cells = [cell for each in residuals for cell in _split_cells(each, self._names)]
         pairs = np.array([_find_prior(name, prior) for name in self._names]).reshape(-1, 2)
         self._mean, self._std = pairs.T
-        # Heights determine processes in the plane too, so the data's share of both is measured against the claims.
-        claims = {"up": prior.vertical, "fix": prior.horizontal}
-        self._usual_std = np.array(
-            [
-                fixes.claimed_m2 if (fixes := claims.get(name.split()[0])) else std
-                for name, std in zip(self._names, self._std, strict=True)
-            ]
-        )
         self._variances, self._covariance = self._mean, np.diag(self._std**2)
         cells = [
             cell
@@ -271,36 +256,21 @@ class _Fit:
             counts.append(cell.square.size / (1.0 + 2.0 * np.square(correlation).sum()) / _REDUNDANCY)
         return np.array(counts)
 
-    def _compute_data_share(self, factors: Floats) -> float:
-        """Return the share of a sum of the densities, by factors (C,), that the data determine."""
-        before = float(np.square(factors * self._usual_std).sum())
-        return float(np.clip(1.0 - factors @ self._covariance @ factors / before, 0.0, 1.0)) if before > 0.0 else 0.0
-
     def get_densities(self) -> dict[str, float]:
         """Return every density by name."""
         return dict(zip(self._names, self._variances.tolist(), strict=True))
 
     def find_noise(self, prior: SensorNoise, white: str, *processes: str) -> SensorNoise:
-        """Return the noise of a sensor by the names of its white density and of its processes.
-
-        Of a white density of which the data determine less than half, the larger of fit and prior.
-        """
-        density, data_share = prior.white, 0.0
-        if white in self._names:
-            row = self._names.index(white)
-            data_share = self._compute_data_share(np.eye(len(self._names))[row])
-            density = float(self._variances[row])
-        if data_share < DETERMINED:
-            density = max(density, prior.white)
+        """Return the noise of a sensor by the names of its white density and of its processes."""
+        density = self.get_densities().get(white, prior.white)
         floor = max(_FLOOR_M**2, _FLOOR_SHARE * prior.claimed_m2) if prior.claimed_m2 else 0.0
         correlated = self.find_process(prior.correlated, *processes)
-        return SensorNoise(max(density, floor), correlated, prior.claimed_m2, data_share)
+        return SensorNoise(max(density, floor), correlated, prior.claimed_m2)
 
     def find_process(self, prior: GaussMarkov, *names: str) -> GaussMarkov:
         """Return the Gauss-Markov process that is nearest to the sum of those of these names.
 
-        Where the data do not determine it, by their share or by the length of the section, it is the larger of fit and
-        prior.
+        Over times that are too long for the section it is the larger of fit and prior.
         """
         taus = {
             row: float(name.rpartition(" ")[2])
@@ -309,17 +279,13 @@ class _Fit:
         }
         if not taus:
             return prior
-        factors, shape = np.zeros(len(self._names)), np.zeros((_SUMMARY_S.size, len(self._names)))
+        shape = np.zeros((_SUMMARY_S.size, len(self._names)))
         for row, tau in taus.items():
-            factors[row] = -2.0 * np.expm1(-_SHARE_S / tau)
             shape[:, row] = GaussMarkov(1.0, tau).difference_variance(_SUMMARY_S)
-        data_share = self._compute_data_share(factors) * float((self._longest_s >= _SUMMARY_S).mean())
         unsure = np.sqrt(np.einsum("ij,jk,ik->i", shape, self._covariance, shape))
         fitted = shape @ self._variances + _PROCESS_MARGIN * unsure
-        undetermined = (self._longest_s < _SUMMARY_S) | (data_share < DETERMINED)
-        return _summarize(
-            np.where(undetermined, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), data_share
-        )
+        least = np.where(self._longest_s < _SUMMARY_S, prior.difference_variance(_SUMMARY_S), 0.0)
+        return _summarize(np.maximum(fitted, least))
 
 
 def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
@@ -354,7 +320,7 @@ def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
 def _find_fix_prior(
     name: str, horizontal: SensorNoise, vertical: SensorNoise, of_heights: Mapping[str, float]
 ) -> tuple[float, float]:
-    """Return the noise of fixes in the plane from that of heights by the ratio of claims, as far as data show it.
+    """Return the noise of fixes in the plane from that of heights by the ratio of claims, where heights are compared.
 
     Heights are compared with a track whose pitch hardly errs, while an odometry's scale hides slow errors of fixes in
     the plane.
@@ -366,17 +332,14 @@ def _find_fix_prior(
     if kind == "moving":
         return 0.0, _MOVING_STD * fixes.claimed_m2
     usual = fixes.correlated.variance * _share_process(fixes.correlated.time_s, float(time_s), FIX_S)
-    usual_std, data_share = _PROCESS_STD * fixes.claimed_m2, vertical.correlated.data_share
-    if axis == "up" or data_share <= 0.0:
-        return usual, usual_std
+    if axis == "up" or not of_heights:
+        return usual, _PROCESS_STD * fixes.claimed_m2
     ratio = horizontal.claimed_m2 / vertical.claimed_m2
     shown = {
         each: ratio * variance for each, variance in of_heights.items() if each.startswith(("up process", "up moving"))
     }
     alike = sum(variance for each, variance in shown.items() if each.endswith(f" {time_s}"))
-    total = max(sum(shown.values()), horizontal.correlated.variance)
-    mean = data_share * alike + (1.0 - data_share) * usual
-    return mean, data_share * _AXES_STD * total + (1.01 - data_share) * usual_std
+    return alike, _AXES_STD * max(sum(shown.values()), horizontal.correlated.variance)
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:
@@ -391,14 +354,14 @@ def _share_process(time_s: float, tau_s: float, taus_s: Sequence[float]) -> floa
     return float(max(0.0, 1.0 - abs(place - taus_s.index(tau_s))))
 
 
-def _summarize(structure: Floats, data_share: float) -> GaussMarkov:
+def _summarize(structure: Floats) -> GaussMarkov:
     """Return the process whose structure function is nearest to one at `_SUMMARY_S`, in the logarithm."""
     if not (structure > 0.0).all():
-        return GaussMarkov(0.0, _SHARE_S, data_share)
+        return GaussMarkov(0.0, 10.0)  # s; any time
     shape = -2.0 * np.expm1(-_SUMMARY_S / _SUMMARY_TAU_S[:, None])
     ratio = np.log(structure / shape)
     best = int(np.argmin(ratio.std(1)))
-    return GaussMarkov(float(np.exp(ratio[best].mean())), float(_SUMMARY_TAU_S[best]), data_share)
+    return GaussMarkov(float(np.exp(ratio[best].mean())), float(_SUMMARY_TAU_S[best]))
 
 
 def make_prior_model(measurements: Measurements) -> NoiseModel:
@@ -429,7 +392,7 @@ def _make_fix_prior(gnss: Positions, axes: slice) -> SensorNoise:
     """Return the noise of fixes whose claims are right in total."""
     claimed = float(np.median(gnss.variance_m2[:, axes]))
     if claimed >= NO_TRUST:  # not measured: there is no error that lasts, which would be kilometres
-        return SensorNoise(claimed, GaussMarkov(0.0, _SHARE_S), claimed)
+        return SensorNoise(claimed, GaussMarkov(0.0, 10.0), claimed)
     prior = PRIORS["fix, centimetres" if claimed < _CENTIMETRES_M2 else "fix, more"]
     return SensorNoise((1.0 - prior.variance) * claimed, GaussMarkov(prior.variance * claimed, prior.time_s), claimed)
 

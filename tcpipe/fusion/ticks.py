@@ -20,7 +20,7 @@ from tcpipe.arrays import Floats, Ints
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
 from tcpipe.fusion.dead_reckoning import compute_course_rate
-from tcpipe.fusion.densities import DETERMINED, PRIORS, NoiseModel
+from tcpipe.fusion.densities import PRIORS, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory, Tests, TickInputs
 from tcpipe.fusion.measurements import NO_TRUST, VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import (
@@ -204,8 +204,6 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     second = np.diff(speed_mps, n=2)[(np.abs(speed_mps) > 0.05)[1:-1]]
     scatter = estimate_robust_std(second) ** 2 / 6.0 if second.size > 1 else 0.0
     density = max(of_run.white, PRIORS[f"{role} velocity"].variance)  # the mean of a tick is no better
-    if of_run.white_data_share < DETERMINED:  # what is claimed beyond the scatter of the samples lasts for 0.1 s
-        density = max(density, 0.1 * (float(np.median(claimed[:, 0])) - scatter))
     found[:, 0] = max(density * rate_hz, scatter) * np.maximum(relative, 1.0)
     for axis in range(1, 3):
         if not np.isfinite(claimed[:, axis]).all() or np.ptp(source.velocity_mps[:, axis]) == 0.0:

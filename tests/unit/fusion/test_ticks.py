@@ -103,7 +103,7 @@ def test_wheels_of_any_rate_carry_the_information_of_their_noise_density(hz):
     steady = np.column_stack((np.ones(stamp_ns.size), np.full((stamp_ns.size, 2), np.nan)))
     source = BodyVelocities(stamp_ns, steady, 1e-6 * steady, steady[:, 1])
     fitted = drive.estimate_noise(m)
-    odometry = replace(fitted.odometries[WHEELS], white=density, white_data_share=1.0)
+    odometry = replace(fitted.odometries[WHEELS], white=density)
     noise = replace(fitted, odometries={**fitted.odometries, WHEELS: odometry})
     output_ns = np.arange(int(drive.ns(0.1)) // TICK_NS, int(drive.ns(19.5)) // TICK_NS) * TICK_NS
     found = build_ticks(
