@@ -32,7 +32,7 @@ from tcpipe.fusion.changes import (
     is_contradicted,
     join_events,
 )
-from tcpipe.fusion.dead_reckoning import compute_course
+from tcpipe.fusion.course import compute_course
 from tcpipe.fusion.densities import PRIORS, NoiseModel, fit_noise, inflate_unclaimed_fixes
 from tcpipe.fusion.filter_kernel import FilterModel, GateVerdict, Memory, Tests, allocate_steps, filter_ticks
 from tcpipe.fusion.initial import find_stationary_intervals

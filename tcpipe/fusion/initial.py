@@ -1,36 +1,32 @@
 """Where a section starts: position, attitude and gyroscope bias, found offline from all that follows.
 
-Yaw comes from the course over ground: the path that the odometry and the gyroscope draw from an arbitrary yaw is laid
-over the GNSS fixes by the rotation that fits best (the planar case of Wahba's problem: the angle of the sum of products
-of complex numbers). At least 5 m at 0.2 m/s or more are asked for, ten standard deviations of the fixes where that is
-longer. Since the odometry's velocity has a sign, a run may start in reverse; since the path is drawn, it may start with
-a turn. Roll and pitch come from the specific force.
+Yaw and position come from the track of an odometry that is aligned with the fixes (`tcpipe.fusion.level_motion`): since
+the odometry's velocity has a sign, a run may start in reverse, and with a turn. Roll and pitch come from the specific
+force.
 
 The robot is stationary where the wheels do not turn and the gyroscope is quiet; wheels at rest on a robot that slides,
 or a gyroscope at rest on a straight, are not enough. It gives two more measurements (zero velocity, and the gyroscope's
 bias) and the initial bias.
-
-Source: B. K. P. Horn, "Closed-form solution of absolute orientation using unit quaternions", JOSA A 4 (4), 1987
-(section 2.B, planar).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints
-from tcpipe.fusion.dead_reckoning import reckon_dead
+from tcpipe.fusion.course import MIN_SPEED_MPS
+from tcpipe.fusion.level_motion import STEP_S, LevelMotion, OdometryTrack, find_level_motion
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.signals import (
-    Plane,
     compute_interval_means,
     compute_median_period_ns,
     compute_seconds,
     compute_slopes,
     compute_window_means,
+    interpolate_signal,
     remove_wild_places,
 )
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
@@ -42,11 +38,21 @@ def find_initial_state(measurements: Measurements, stationary_ns: Ints, start_ns
     """Return the state at ``start_ns`` [ns], the first stamp of a section; ``stationary_ns`` [ns], (K, 2): stops."""
     bias, bias_std = _estimate_gyro_bias(measurements.imu, stationary_ns)
     roll, pitch, tilt_std = _estimate_tilt(measurements.imu, stationary_ns, start_ns)
-    path = _Path(measurements, start_ns, bias)
-    yaw, yaw_std, heading_from = _estimate_yaw(measurements, path, start_ns, bias_std)
+    m, has_odometry = measurements, bool(measurements.odometries())
+    if m.imu is not None:
+        m = replace(m, imu=replace(m.imu, angular_velocity_radps=m.imu.angular_velocity_radps - bias))
+    if m.gnss is not None and not m.is_antenna_alone and not has_odometry:  # it drives forward
+        m = replace(m, wheels=_read_speeds(m.gnss))
+    motion = find_level_motion(m)
+    track = next(iter(motion.tracks.values()), None) if motion is not None else None
+    yaw, yaw_std, heading_from = _estimate_yaw(m, motion, track, start_ns, bias_std)
     quat = quat_from_rpy(roll, pitch, yaw)
-    position, position_std = _estimate_position(measurements.gnss, path, quat, yaw)
-    velocity, velocity_std = path.start_velocity(yaw, pitch)
+    position, position_std = _estimate_position(m.gnss, track, quat, start_ns)
+    velocity, velocity_std = np.zeros(3), 2.0  # m/s: no sensor shows it
+    if m.first_odometry is not None:
+        along = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
+        velocity = float(np.median(m.first_odometry.velocity_mps[:5, 0])) * along
+        velocity_std = 0.3 if has_odometry else 1.0
     return InitialState(
         position_enu_m=position,
         position_std_m=position_std,
@@ -81,30 +87,6 @@ def _estimate_tilt(imu: InertialMeasurements | None, stationary_ns: Ints, start_
     return roll, pitch, 0.03 if stands else 0.08
 
 
-class _Path:
-    """The path by `DeadReckoning`; without odometry the robot drives forward at the speed of the fixes."""
-
-    def __init__(self, m: Measurements, start_ns: int, bias: Floats) -> None:
-        self.start_ns, self.is_shown, self._has_odometry = start_ns, not m.is_antenna_alone, bool(m.odometries())
-        if m.gnss is not None and self.is_shown and not self._has_odometry:
-            m = replace(m, wheels=_read_speeds(m.gnss))
-        self.reckoned = reckon_dead(m, start_ns, float(bias[2]))
-        self._lever = 0j if m.gnss is None else complex(*m.gnss.lever_arm_m[:2])
-
-    def antenna(self, at_s: Floats, yaw: float = 0.0) -> Plane:
-        """Return the antenna east + i north [m] for a yaw at the start [rad]."""
-        body = self.reckoned.place(at_s) + self._lever * np.exp(1j * self.reckoned.yaw(at_s))
-        placed: Plane = body * np.exp(1j * yaw)
-        return placed
-
-    def start_velocity(self, yaw: float, pitch: float) -> tuple[Floats, float]:
-        """Return the velocity at the start and its standard deviation [m/s]."""
-        if not self.reckoned.forward_mps.size:
-            return np.zeros(3), 2.0  # no sensor shows it
-        speed, std_mps = float(np.median(self.reckoned.forward_mps[:5])), 0.3 if self._has_odometry else 1.0
-        return speed * np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]), std_mps
-
-
 def _read_speeds(gnss: Positions) -> BodyVelocities:
     """Return how fast fixes move, as the odometry of a robot that drives forward."""
     places, window_s = remove_wild_places(gnss.position_enu_m), max(1.0, 3e-9 * compute_median_period_ns(gnss.stamp_ns))
@@ -113,9 +95,11 @@ def _read_speeds(gnss: Positions) -> BodyVelocities:
     return BodyVelocities(gnss.stamp_ns, velocity, unknown, unknown[:, 0])
 
 
-def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_std: float) -> tuple[float, float, str]:
+def _estimate_yaw(
+    m: Measurements, motion: LevelMotion | None, track: OdometryTrack | None, start_ns: int, bias_std: float
+) -> tuple[float, float, str]:
     """Return the yaw at the start [rad], its standard deviation, and its source."""
-    gnss, imu = measurements.gnss, measurements.imu
+    gnss, imu = m.gnss, m.imu
     oriented = (
         np.empty((0, 4))
         if imu is None
@@ -124,76 +108,39 @@ def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_s
     own, source = (float(rpy_from_quat(oriented[0])[2]), "orientation") if len(oriented) else (0.0, "")
     if gnss is None:
         return own, 0.01, source or "local frame"
+    if track is not None:
+        shown_s = STEP_S * float(np.argmax(np.abs(track.speed_mps) > MIN_SPEED_MPS))
+        std = float(np.hypot(np.hypot(track.heading_std_rad, 0.03), bias_std * shown_s))
+        return float(track.heading_rad[0]), min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
     posed = np.flatnonzero(np.isfinite(gnss.quat_xyzw).all(1))[:1] if gnss.quat_xyzw is not None else np.empty(0, int)
-    fit = _fit_course(gnss, path) if path.is_shown else None
-    if fit is not None:
-        std = float(np.hypot(np.hypot(fit.yaw_std_rad, 0.03), bias_std * fit.centre_s))
-        return fit.yaw_rad, min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
     if gnss.quat_xyzw is not None and posed.size:  # the first attitude of a pose, less what the robot turned until then
-        turned = path.reckoned.yaw(compute_seconds(gnss.stamp_ns[posed], start_ns))
-        return float(rpy_from_quat(gnss.quat_xyzw[posed[0]])[2] - turned[0]), 0.1, "pose"  # rad: its frame and mounting
+        at_s, turned = compute_seconds(gnss.stamp_ns[posed], start_ns), 0.0
+        if motion is not None:
+            turned = float(np.interp(at_s, motion.attitude.time_s, motion.attitude.yaw_rad)[0])
+        return float(rpy_from_quat(gnss.quat_xyzw[posed[0]])[2]) - turned, 0.1, "pose"  # rad: its frame and mounting
     return own, _UNKNOWN_YAW_STD_RAD, source or "unknown"
 
 
-@dataclass(frozen=True, slots=True)
-class _Fit:
-    """Yaw at the start by a window of fixes, its σ, the fixes' RMS distance from the path, the window's middle."""
-
-    yaw_rad: float
-    yaw_std_rad: float
-    residual_m: float
-    centre_s: float
-
-
-def _fit_course(gnss: Positions, path: _Path) -> _Fit | None:
-    """Return the fit of the first window of fixes to the drawn path; the best of all where none fits well."""
-    stamp_s = compute_seconds(gnss.stamp_ns, path.start_ns)
-    fixes = remove_wild_places(gnss.position_enu_m)
-    noise = float(np.median(np.sqrt(gnss.variance_m2[:, :2].mean(1))))
-    wanted = max(5.0, 10.0 * noise)  # [m]: yaw to 6°
-    drawn = path.antenna(stamp_s)
-    found: list[_Fit] = []
-    for first in np.unique(np.searchsorted(stamp_s, np.arange(stamp_s[0], stamp_s[-1], 2.0))):  # step [s]
-        near = slice(first, int(np.searchsorted(stamp_s, stamp_s[first] + 120.0, "right")))  # longest [s]
-        far = np.flatnonzero(np.abs(fixes[near] - fixes[first]) >= wanted)
-        if far.size == 0:
-            continue
-        rows = slice(first, first + int(far[0]) + 1)
-        fit = _fit(fixes[rows], drawn[rows], stamp_s[rows], noise)
-        if fit is not None:
-            found.append(fit)
-            if fit.residual_m <= max(3 * noise, 0.05 * wanted):
-                return fit
-    return min(found, key=lambda each: each.residual_m, default=None)
-
-
-def _fit(fixes: Plane, drawn: Plane, stamp_s: Floats, noise_m: float) -> _Fit | None:
-    """Return the rotation (and scale) that fits the drawn path to the fixes; None if only the fixes move."""
-    a, b = fixes - fixes.mean(), drawn - drawn.mean()
-    extent2 = float(np.sum(np.abs(b) ** 2))
-    if extent2 < 1.0 or np.sqrt(extent2) < 0.2 * np.sqrt(np.sum(np.abs(a) ** 2)):
-        return None
-    product = np.sum(a * np.conj(b))
-    residual = float(np.sqrt(np.mean(np.abs(a - product / extent2 * b) ** 2)))
-    std = max(noise_m, residual) / np.sqrt(extent2 / min(fixes.size, 10))
-    return _Fit(float(np.angle(product)), float(std), residual, float(stamp_s.mean()))
-
-
-def _estimate_position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> tuple[Floats, Floats]:
+def _estimate_position(
+    gnss: Positions | None, track: OdometryTrack | None, quat: Floats, start_ns: int
+) -> tuple[Floats, Floats]:
     """Return base_link at the start and its σ: the median of the first fixes less the displacement since the start."""
     if gnss is None:
         return np.zeros(3), np.full(3, 1e-3)
     few = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 1_000_000_000, "right"), 3, 10)))
-    at_s = compute_seconds(gnss.stamp_ns[few], path.start_ns)
-    drawn = path.antenna(at_s, yaw)
-    off = gnss.position_enu_m[few] - np.column_stack((drawn.real, drawn.imag, np.zeros(at_s.size)))
-    position: Floats = np.median(off, axis=0) - [0.0, 0.0, rotate(quat, gnss.lever_arm_m)[2]]
+    at_s, driven_m = compute_seconds(gnss.stamp_ns[few], start_ns), 0.0
+    moved_m = np.broadcast_to(rotate(quat, gnss.lever_arm_m), (at_s.size, 3))
+    if track is not None:
+        grid_s = STEP_S * np.arange(track.speed_mps.size)
+        moved_m = interpolate_signal(grid_s, track.path_m + track.arm_m, at_s)
+        driven_m = STEP_S * float(np.abs(track.speed_mps[grid_s < at_s[-1]]).sum())
+    off = gnss.position_enu_m[few] - moved_m
     std: Floats = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
     if (
         not gnss.has_heights
     ):  # they count from the start: kilometres of uncertainty would lean on the plane by every tilt
         std[2] = 0.0
-    driven_m = path.reckoned.length(float(at_s[-1]))
+    position: Floats = np.median(off, axis=0)
     return position, std + np.array([0.1, 0.1, 0.2]) * max(driven_m, 1.0) + np.ptp(off, axis=0)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints
+from tcpipe.fusion.course import compute_course_rate
 from tcpipe.fusion.measurements import IMU, BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import (
     Plane,
@@ -32,6 +33,8 @@ from tcpipe.geometry.rotation import matrix_from_quat, multiply, normalize, quat
 
 _Number = TypeVar("_Number", np.float64, np.complex128)
 
+COURSE = "course over ground"
+"""Source of the yaw rate where no sensor measures it."""
 STEP_S, KNOT_S = 0.05, 60.0
 """Steps of the grid of times, and between knots of the drift of heading [s]."""
 _ROUNDS, _FEWEST = 8, 4
@@ -56,9 +59,13 @@ class Attitude:
 
 
 def get_turn_rates(measurements: Measurements, role: str) -> tuple[Ints, Floats]:
-    """Return stamps [ns] and angular velocities (N, 3) of a sensor; zero about x and y if not measured."""
+    """Return stamps [ns] and angular velocities (N, 3) of a sensor or `COURSE`; zero about x and y if not measured."""
     if role == IMU and measurements.imu is not None:
         return measurements.imu.stamp_ns, measurements.imu.angular_velocity_radps
+    if role == COURSE and measurements.gnss is not None:
+        zero_ns = int(measurements.gnss.stamp_ns[0])
+        stamp_s, yaw_rate = compute_course_rate(measurements.gnss, measurements.first_odometry, zero_ns)
+        return zero_ns + np.rint(1e9 * stamp_s).astype(np.int64), yaw_rate[:, None] * np.array([0.0, 0.0, 1.0])
     source = measurements.odometries()[role]
     finite = np.isfinite(source.yaw_rate_radps)
     rate = np.zeros((int(finite.sum()), 3))
@@ -73,8 +80,8 @@ def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Att
     imu = measurements.imu
     # Slower IMUs show no turns [ns].
     shows = imu is not None and imu.stamp_ns.size >= _FEWEST and compute_median_period_ns(imu.stamp_ns) <= 100_000_000
-    role = IMU if shows else next(reversed(measurements.turning_odometries()), "")
-    if not role or end_s < 2 * STEP_S:
+    role = IMU if shows else next(reversed(measurements.turning_odometries()), COURSE)
+    if end_s < 2 * STEP_S or (role == COURSE and measurements.gnss is None):
         return None
     time_s = np.arange(0.0, end_s + STEP_S, STEP_S)
     stamp_ns, rate = get_turn_rates(measurements, role)
@@ -151,12 +158,14 @@ class OdometryTrack:
     heading_rad : (n,) of base_link's x-axis, from east where there are fixes.
     path_m : (n, 3) of base_link, from zero on; east, north, up where there are fixes.
     arm_m : (n, 3) the antenna from base_link in the same axes, with what a time offset of the fixes adds.
+    heading_std_rad : standard deviation of the heading by the fixes.
     """
 
     speed_mps: Floats
     heading_rad: Floats
     path_m: Floats
     arm_m: Floats
+    heading_std_rad: float = 0.0
 
 
 def compute_forward_mps(source: BodyVelocities, attitude: Attitude, zero_ns: int) -> Floats:
@@ -182,6 +191,38 @@ def make_free_track(forward_mps: Floats, attitude: Attitude) -> OdometryTrack:
     return OdometryTrack(forward_mps * level, attitude.yaw_rad, path, np.zeros_like(path))
 
 
+@dataclass(frozen=True, slots=True)
+class LevelMotion:
+    """Motion of a section by its odometries and turns.
+
+    Attributes
+    ----------
+    zero_ns : zero of all times [ns]: the first measurement of fixes or odometries.
+    attitude : on the grid.
+    forward_mps : by odometry, base_link's forward velocity on the grid, (n,).
+    tracks : by odometry, aligned with the fixes; none where these show no motion.
+    """
+
+    zero_ns: int
+    attitude: Attitude
+    forward_mps: Mapping[str, Floats]
+    tracks: Mapping[str, OdometryTrack]
+
+
+def find_level_motion(measurements: Measurements) -> LevelMotion | None:
+    """Return how the body moved; None without odometry, or where nothing shows turns."""
+    odometries, gnss = measurements.odometries(), measurements.gnss
+    stamps = [each.stamp_ns for each in odometries.values()] + ([] if gnss is None else [gnss.stamp_ns])
+    zero_ns = min((int(stamp_ns[0]) for stamp_ns in stamps), default=0)
+    end_s = (max((int(stamp_ns[-1]) for stamp_ns in stamps), default=0) - zero_ns) * 1e-9
+    attitude = find_attitude(measurements, zero_ns, end_s)
+    if attitude is None or not odometries:
+        return None
+    forward = {role: compute_forward_mps(each, attitude, zero_ns) for role, each in odometries.items()}
+    tracks = {} if gnss is None else align_tracks(forward, gnss, attitude, zero_ns)
+    return LevelMotion(zero_ns, attitude, forward, tracks)
+
+
 def align_tracks(
     forward_mps: Mapping[str, Floats], gnss: Positions, attitude: Attitude, zero_ns: int
 ) -> dict[str, OdometryTrack]:
@@ -204,13 +245,17 @@ def align_tracks(
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Transformation of a dead-reckoned track to fixes: ``turn_rad`` (n,) on the grid; ``noise_m``: median residual."""
+    """Transformation of a dead-reckoned track to fixes.
+
+    ``turn_rad`` (n,) on the grid; ``noise_m``: median residual; ``turn_std_rad``: what it makes of a window's heading.
+    """
 
     turn_rad: Floats
     scale: float = 1.0
     arm_m: complex = 0j
     offset_s: float = 0.0
     noise_m: float = np.inf
+    turn_std_rad: float = np.inf
 
 
 class _Alignment:
@@ -292,6 +337,7 @@ class _Alignment:
                 fit.arm_m + complex(found[2], found[3]),
                 fit.offset_s + float(found[4]),
                 noise,
+                noise / float(np.median(length[moving])),
             )
         return fit
 
@@ -305,7 +351,8 @@ class _Alignment:
         path = integrate_grid(np.stack((velocity.real, velocity.imag, climb), -1))
         level = np.abs(velocity) * np.sign(speed)
         heading = self._attitude.yaw_rad + fit.turn_rad
-        return OdometryTrack(level, heading, path, np.stack((arm.real, arm.imag, self._arm_m[:, 2]), -1))
+        placed = np.stack((arm.real, arm.imag, self._arm_m[:, 2]), -1)
+        return OdometryTrack(level, heading, path, placed, fit.turn_std_rad)
 
     def _fit_pitch(self, speed: Floats, climb: Floats) -> Floats:
         """Return the slow error of pitch [rad] on the grid (n,) with which the track climbs as the fixes do."""

@@ -21,13 +21,12 @@ import numpy as np
 
 from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.fusion.level_motion import (
+    COURSE,
     STEP_S,
     Attitude,
     OdometryTrack,
-    align_tracks,
     average_grid,
-    compute_forward_mps,
-    find_attitude,
+    find_level_motion,
     integrate_grid,
     make_free_track,
 )
@@ -101,19 +100,14 @@ class _Section:
 
 def find_residuals(measurements: Measurements) -> list[Residuals]:
     """Return the residuals of all pairs of sensors that can be compared; none without odometry or without turns."""
-    odometries, gnss = measurements.odometries(), measurements.gnss
-    stamps = [each.stamp_ns for each in odometries.values()] + ([] if gnss is None else [gnss.stamp_ns])
-    zero_ns = min((int(stamp_ns[0]) for stamp_ns in stamps), default=0)
-    end_s = (max((int(stamp_ns[-1]) for stamp_ns in stamps), default=0) - zero_ns) * 1e-9
-    attitude = find_attitude(measurements, zero_ns, end_s)
-    if attitude is None or not odometries:
+    motion, gnss = find_level_motion(measurements), measurements.gnss
+    if motion is None or motion.attitude.role == COURSE:
         return []
+    zero_ns, attitude, forward, tracks = motion.zero_ns, motion.attitude, motion.forward_mps, motion.tracks
     rows = np.arange(0, attitude.time_s.size, round(_PAIR_STEP_S / STEP_S))
     at_ns = zero_ns + np.rint(attitude.time_s[rows] * 1e9).astype(np.int64)
     section = _Section(measurements, attitude, zero_ns, rows, at_ns)
     residuals = list[Residuals]()
-    forward = {role: compute_forward_mps(each, attitude, zero_ns) for role, each in odometries.items()}
-    tracks = {} if gnss is None else align_tracks(forward, gnss, attitude, zero_ns)
     speed = np.abs(average_grid(np.column_stack([*forward.values()]), 0.5)).max(axis=1)  # averages noise [s]
     for role, track in tracks.items():
         residuals += _compare_fixes(section, gnss, role, track, speed) if gnss is not None else []

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tcpipe.arrays import Floats, Ints
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
-from tcpipe.fusion.dead_reckoning import compute_course_rate
+from tcpipe.fusion.course import compute_course_rate
 from tcpipe.fusion.densities import PRIORS, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory, Tests, TickInputs
 from tcpipe.fusion.measurements import NO_TRUST, VISUAL, WHEELS, BodyVelocities, Measurements

@@ -14,7 +14,7 @@ from tcpipe.fusion.checks.clock_offsets import (
     shift_sensors,
 )
 from tcpipe.fusion.checks.sanity import SensorExclusion
-from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS
+from tcpipe.fusion.course import MIN_SPEED_MPS
 from tcpipe.fusion.measurements import DOPPLER, GNSS
 from tcpipe.fusion.preparation import inflate_late_fixes
 from tcpipe.fusion.signals import MAX_GAP_NS

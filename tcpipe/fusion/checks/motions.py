@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tcpipe.arrays import Floats, Ints
-from tcpipe.fusion.dead_reckoning import MIN_SPEED_MPS, DeadReckoning
+from tcpipe.fusion.course import MIN_SPEED_MPS
 from tcpipe.fusion.level_motion import compute_levelling_rotations
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import (
@@ -173,8 +173,8 @@ def dead_reckon(twist: Floats) -> Plane:
     """Return the path [m] of a twist (M, 2) from the origin along the real axis, shape (M,); NaN if unknown."""
     known = np.asarray(np.isfinite(twist).all(1))
     forward_mps, yaw_rate_radps = np.where(known[:, None], twist, 0.0).T
-    at_s: Floats = GRID_S * np.arange(len(twist), dtype=np.float64)
-    return np.where(known, DeadReckoning(at_s, forward_mps, at_s, yaw_rate_radps).place(at_s), np.nan)
+    yaw_rad = GRID_S * (np.cumsum(yaw_rate_radps) - 0.5 * yaw_rate_radps)
+    return np.where(known, GRID_S * np.cumsum(forward_mps * np.exp(1j * yaw_rad)), np.nan)
 
 
 # Lags between signals

@@ -3,24 +3,8 @@
 import numpy as np
 import pytest
 
-from tcpipe.fusion.dead_reckoning import DeadReckoning, compute_course_rate
+from tcpipe.fusion.course import compute_course_rate
 from tcpipe.fusion.measurements import Positions
-
-
-def test_a_circle_closes_and_is_as_long_as_its_circumference():
-    at_s, rate_radps = np.arange(0.0, 20.0, 0.02), 2.0 * np.pi / 20.0
-    path = DeadReckoning(at_s, np.full(at_s.size, 0.5), at_s[::3], np.full(at_s[::3].size, rate_radps))
-    wanted_s = np.array([0.0, 5.0, 10.0, 20.0])
-    radius_m = 0.5 / rate_radps
-    assert path.place(wanted_s) == pytest.approx(radius_m * np.array([0, 1 + 1j, 2j, 0]), abs=1e-4)
-    assert path.yaw(wanted_s) == pytest.approx(rate_radps * wanted_s)
-    assert path.length(20.0) == pytest.approx(2.0 * np.pi * radius_m)
-
-
-def test_without_samples_the_path_stays_at_the_origin():
-    nothing = np.empty(0)
-    path = DeadReckoning(nothing, nothing, nothing, nothing)
-    assert path.place(np.array([0.0, 3.0])).tolist() == [0.0, 0.0]
 
 
 def _circling(hz, speed_mps=0.9, rate_radps=0.3):
