@@ -13,7 +13,6 @@ from tcpipe.fusion.measurements import (
     InitialState,
     Measurements,
     Positions,
-    Rejections,
     Trajectory,
 )
 from tcpipe.geometry.rotation import quat_from_matrix, quat_from_rpy, rotation_vector_from_quat, rpy_from_matrix
@@ -178,7 +177,7 @@ def true_track(truth):
         position_std_m=np.full((rows.size, 3), 0.01),
         yaw_std_rad=np.full(rows.size, 0.005),
         forward_velocity_std_mps=np.full(rows.size, 0.01),
-        rejections=Rejections(np.empty(0, np.int64), *np.empty((2, 0), np.str_), *np.empty((2, 0))),
+        rejections={},
         displacement_std_m=np.full((rows.size, 1), 0.01) * DISPLACEMENT_LAGS_S,
         facts=StretchFacts({}, {}, {}),
     )

@@ -13,8 +13,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints
 from tcpipe.errors import FusionError
@@ -46,7 +48,6 @@ from tcpipe.fusion.measurements import (
     WHEELS,
     InitialState,
     Measurements,
-    Rejections,
     Trajectory,
 )
 from tcpipe.fusion.pair_residuals import Residuals, find_residuals
@@ -437,36 +438,29 @@ def _list_rows(m: Measurements, made: Pass) -> Mapping[int, tuple[Ints, Ints]]:
     return found
 
 
-def _make_rejections(m: Measurements, made: Pass) -> Rejections:
+def _make_rejections(m: Measurements, made: Pass) -> dict[str, NDArray[Any]]:
+    """Return the rejected measurements, in time order: columns of the level REJECTIONS."""
     parts = []
     for kind, (stamp_ns, tick) in _list_rows(m, made).items():
         refused = made.tests.verdict[tick, kind] == GateVerdict.REJECTED
         parts.append((stamp_ns[refused], np.full(int(refused.sum()), ROLES[kind]), made.tests.nis[tick[refused], kind],
                       np.full(int(refused.sum()), made.model.gates[kind])))  # fmt: skip
-    stamp_ns, role, nis, gate = (np.concatenate(values) for values in zip(*parts, strict=True))
-    order = np.argsort(stamp_ns, kind="stable")
-    return Rejections(stamp_ns[order], role[order], np.full(order.size, "gate"), nis[order], gate[order])
+    names = "stamp_ns", "role", "normalized_innovation_squared", "threshold"
+    columns = {name: np.concatenate(values) for name, values in zip(names, zip(*parts, strict=True), strict=True)}
+    order = np.argsort(columns["stamp_ns"], kind="stable")
+    return {name: values[order] for name, values in columns.items()} | {"reason": np.full(order.size, "gate")}
 
 
-def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
-    """Return each gate reset: since when the sensor was rejected, and its difference."""
-    found = []
-    for kind, role in ((kind, role) for kind, role in ROLES.items() if kind != Kind.ATTITUDE):
-        verdict, stamp_ns = made.tests.verdict[:, kind], made.ticks.stamp_ns
-        for tick in np.flatnonzero(verdict == GateVerdict.RESET):
-            heard = np.flatnonzero((verdict[:tick] != GateVerdict.REJECTED) & (verdict[:tick] != GateVerdict.NONE))
-            since = (
-                np.flatnonzero(verdict[heard[-1] + 1 : tick] == GateVerdict.REJECTED) + heard[-1] + 1
-                if heard.size
-                else []
-            )
-            first = since[0] if len(since) else tick
-            off = made.tests.fix_innovation[tick, :2]
-            if kind != Kind.FIX:  # the forward velocity of the tick before
-                off = made.ticks.inputs.value[tick, kind, :1] - made.states[max(int(tick) - 1, 0), Error.U + 6]
-            size = float(np.linalg.norm(off))
-            found.append(GateReset(role, int(stamp_ns[first]), int(stamp_ns[tick]), size))
-    return tuple(sorted(found, key=lambda each: each.start_ns))
+def _find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
+    """Return each gate reset of the fixes: since when they were rejected, and how far they were off [m]."""
+    verdict, stamp_ns = made.tests.verdict[:, Kind.FIX], made.ticks.stamp_ns
+    rows = np.flatnonzero(verdict != GateVerdict.NONE)
+    starts = rows[np.diff((verdict[rows] == GateVerdict.REJECTED).astype(np.int8), prepend=0) > 0]
+    resets = np.flatnonzero(verdict == GateVerdict.RESET)
+    return tuple(
+        GateReset(int(stamp_ns[first]), int(stamp_ns[tick]), float(np.linalg.norm(made.tests.fix_innovation[tick, :2])))
+        for first, tick in zip(starts[np.searchsorted(starts, resets) - 1], resets, strict=True)
+    )
 
 
 def _list_changes(made: Pass, smoothed: Smoothed, explained: Hypothesis) -> Iterator[ChangeFacts]:
@@ -497,7 +491,7 @@ def _make_facts(  # noqa: PLR0917
         nis_mean=nis,
         measurements={role: int(verdict.size) for role, verdict in verdicts.items()},
         rejected={role: int((verdict == GateVerdict.REJECTED).sum()) for role, verdict in verdicts.items()},
-        gate_resets=find_gate_resets(made),
+        gate_resets=_find_gate_resets(made),
         changes=tuple(_list_changes(made, smoothed, explained)),
         common_scale_std=scale_std,
         parameters=_describe_parameters(m, made, smoothed, std),

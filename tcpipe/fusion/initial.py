@@ -129,12 +129,14 @@ def _estimate_position(
         return np.zeros(3), np.full(3, 1e-3)
     few = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 1_000_000_000, "right"), 3, 10)))
     at_s, driven_m = compute_seconds(gnss.stamp_ns[few], start_ns), 0.0
-    moved_m = np.broadcast_to(rotate(quat, gnss.lever_arm_m), (at_s.size, 3))
+    antenna_m = rotate(quat, gnss.lever_arm_m)
     if track is not None:
-        grid_s = STEP_S * np.arange(track.speed_mps.size)
-        moved_m = interpolate_signal(grid_s, track.path_m + track.arm_m, at_s)
+        grid_s: Floats = STEP_S * np.arange(track.speed_mps.size, dtype=np.float64)
+        turned = np.exp(1j * np.interp(at_s, grid_s, track.heading_rad)) * complex(*gnss.lever_arm_m[:2])
+        moved_m = interpolate_signal(grid_s, track.path_m, at_s)
+        antenna_m = moved_m + np.column_stack((turned.real, turned.imag, np.full(at_s.size, antenna_m[2])))
         driven_m = STEP_S * float(np.abs(track.speed_mps[grid_s < at_s[-1]]).sum())
-    off = gnss.position_enu_m[few] - moved_m
+    off = gnss.position_enu_m[few] - antenna_m
     std: Floats = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
     if (
         not gnss.has_heights

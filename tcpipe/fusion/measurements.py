@@ -275,26 +275,6 @@ DISPLACEMENT_LAGS_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Rejections:
-    """Measurements that the gate rejected, in time order.
-
-    Attributes
-    ----------
-    stamp_ns : [ns], shape (M,), int64.
-    role : shape (M,), str; gnss, gnss_velocity, imu, wheel_odometry or visual_odometry.
-    reason : shape (M,), str; gate (chi-square), invalid (not finite) or covariance (unusable).
-    normalized_innovation_squared : [1], shape (M,); NaN where it was not computed.
-    threshold : [1], shape (M,), the gate; NaN where it was not computed.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    role: NDArray[np.str_]
-    reason: NDArray[np.str_]
-    normalized_innovation_squared: NDArray[np.float64]
-    threshold: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
 class Trajectory:
     """States of base_link at ``stamp_ns``.
 
@@ -307,7 +287,7 @@ class Trajectory:
     angular_velocity_radps : [rad/s], shape (N, 3), base_link axes.
     yaw_std_rad : [rad], shape (N,).
     forward_velocity_std_mps : [m/s], shape (N,), of the velocity along base_link's x axis.
-    rejections : what the gate refused.
+    rejections : what the gate rejected, in time order: columns of the level REJECTIONS, shape (M,).
     displacement_std_m : [m], shape (N, 6), of the horizontal displacement from each row to the one
         `DISPLACEMENT_LAGS_S` later, along its direction, the correlation of both ends counted exactly; NaN where no row
         stands there, and throughout in a forward filter, which does not know it. In between the variance may be
@@ -323,7 +303,7 @@ class Trajectory:
     position_std_m: NDArray[np.float64]
     yaw_std_rad: NDArray[np.float64]
     forward_velocity_std_mps: NDArray[np.float64]
-    rejections: Rejections
+    rejections: Mapping[str, NDArray[Any]]
     displacement_std_m: NDArray[np.float64]
     facts: StretchFacts
 

@@ -11,7 +11,6 @@ The state of filterpy is the error of the estimate, zero between its steps: no a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -28,16 +27,6 @@ from tcpipe.fusion.state import Error, Kind
 from tcpipe.fusion.ticks import Pass, Ticks
 
 _MAX_ANGLE_STD_RAD = 1.0  # sigma points lie at √3 σ, and must not go round the circle
-_MEASURED_ERRORS: Mapping[int, int] = {
-    Kind.WHEELS: Error.U,
-    Kind.VISUAL: Error.U,
-    Kind.DOPPLER: Error.U,
-    Kind.STATIONARY: Error.U,
-    Kind.STATIONARY_RATE: Error.GYRO_BIAS,
-    Kind.FIX: Error.RHO,
-    Kind.ATTITUDE: Error.THETA,
-}
-"""First of the three errors that a gate reset inflates, by kind of measurement."""
 
 
 def run_ukf15(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_probability: float) -> Trajectory:
@@ -62,8 +51,8 @@ def run_ukf15(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_p
 def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pass, Smoothed]:
     """Return the forward pass over all ticks, and its estimate, without variances of displacements (NaN).
 
-    If the gate has rejected all measurements of one kind for 5 s (and five of them), the errors that they measure are
-    inflated by the innovation, and the measurement is used.
+    If the gate has rejected fixes or attitudes for as long as the default estimator allows, σ of pose and velocity is
+    inflated, and the measurement is used.
     """
     size, period_s = ticks.stamp_ns.size, ticks.inputs.period_s
     ukf, tests = _Filter(ticks, model, start), make_tests(size)
@@ -80,9 +69,9 @@ def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pas
             if not nis <= model.gates[kind]:
                 verdict, since = GateVerdict.REJECTED, rejected[kind]
                 since.append(k)
-                if len(since) >= 5 and (k - since[0]) * period_s >= 5.0:
+                if len(since) >= 5 and (k - since[0]) * period_s >= model.patience_s[kind]:
                     verdict = GateVerdict.RESET
-                    ukf.inflate(kind, innovation)
+                    ukf.inflate()
                     ukf.update(k, kind, np.inf)
             if verdict != GateVerdict.REJECTED:
                 rejected[kind].clear()
@@ -163,15 +152,11 @@ class _Filter:
             self._correct()
         return ukf.y, nis
 
-    def inflate(self, kind: int, innovation: Floats) -> None:
-        """Add the squared innovation to the variance of the errors that a kind of measurement measures."""
-        first = int(np.searchsorted(self._model.active, _MEASURED_ERRORS[kind]))
-        variance = float(innovation @ innovation)
-        rows = [first, first + 1, first + 2]
-        self._ukf.P[rows, rows] += variance if first != Error.THETA else min(variance, _MAX_ANGLE_STD_RAD**2)
-        if kind == Kind.FIX:  # a wrong yaw and velocity lead positions astray
-            rows = [Error.THETA + 2, *range(Error.U, Error.U + 3)]
-            self._ukf.P[rows, rows] += np.square([_MAX_ANGLE_STD_RAD, 0.3, 0.3, 0.3])  # m/s: as at the start
+    def inflate(self) -> None:
+        """Make σ of pose and velocity ten times as large."""
+        angles, moving = range(Error.RHO), range(Error.GYRO_BIAS)
+        self._ukf.P[moving, moving] *= 100.0
+        self._ukf.P[angles, angles] = np.minimum(self._ukf.P[angles, angles], _MAX_ANGLE_STD_RAD**2)
 
     def compute_variances(self) -> Floats:
         """Return the variance of position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], shape (5,)."""

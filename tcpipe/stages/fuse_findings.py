@@ -93,17 +93,14 @@ def find_fuse_findings(inputs: Sequence[Section], facts: FuseFacts, *, run: Subj
 
 
 def _find_gate_resets(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
-    """Yield by sensor how often it contradicted the others for seconds, and where most."""
+    """Yield how often fixes contradicted the odometry for seconds, and where most."""
     gate_resets = [gate_reset for section in facts.stretches for gate_reset in section.gate_resets]
     odometries = [role for role in (WHEELS, VISUAL) if role in facts.sensors]
-    for role in sorted({gate_reset.role for gate_reset in gate_resets}):
-        of_role = [gate_reset for gate_reset in gate_resets if gate_reset.role == role]
-        worst = max(of_role, key=lambda gate_reset: gate_reset.size)
-        is_fix = role == GNSS
-        code, off = ("gnss-contradicts-odometry", "off_m") if is_fix else ("odometry-contradicts-others", "off_mps")
-        suspect = {"suspect": odometries[0]} if is_fix and len(odometries) == 1 else {}
-        numbers: dict[str, Any] = {off: worst.size, "event_count": len(of_role)}
-        yield make_finding(code, Subject("role", role), span_s=_find_span_s(worst, first_ns), names=suspect, **numbers)
+    if gate_resets:
+        worst = max(gate_resets, key=lambda gate_reset: gate_reset.size)
+        suspect, span_s = {"suspect": odometries[0]} if len(odometries) == 1 else {}, _find_span_s(worst, first_ns)
+        numbers: dict[str, Any] = {"off_m": worst.size, "event_count": len(gate_resets)}
+        yield make_finding("gnss-contradicts-odometry", Subject("role", GNSS), span_s=span_s, names=suspect, **numbers)
 
 
 def _find_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Finding]:

@@ -158,14 +158,14 @@ def make_rejections_table(sections: Sequence[Section], found: Sequence[Trajector
     invalid = [(role, each.invalid_ns) for section in sections for role, each in sorted(section.prepared.items())]
     size = sum(stamps.size for _, stamps in invalid)
     unknown = np.full(size, np.nan)
-    columns = {
-        "stamp_ns": [p.stamp_ns for p in parts] + [stamps for _, stamps in invalid],
-        "role": [p.role for p in parts] + [np.full(stamps.size, role) for role, stamps in invalid],
-        "reason": [p.reason for p in parts] + [np.full(size, "invalid")],
-        "normalized_innovation_squared": [p.normalized_innovation_squared for p in parts] + [unknown],
-        "threshold": [p.threshold for p in parts] + [unknown],
+    unusable = {
+        "stamp_ns": [stamps for _, stamps in invalid],
+        "role": [np.full(stamps.size, role) for role, stamps in invalid],
+        "reason": [np.full(size, "invalid")],
+        "normalized_innovation_squared": [unknown],
+        "threshold": [unknown],
     }
-    joined = {name: np.concatenate(values) for name, values in columns.items()}
+    joined = {name: np.concatenate([p[name] for p in parts] + values) for name, values in unusable.items()}
     joined["role"] = np.where(joined["role"] == GNSS, fixes, joined["role"])
     order = np.lexsort((joined["role"], joined["stamp_ns"]))
     return REJECTIONS.table(**{name: values[order] for name, values in joined.items()})

@@ -21,7 +21,7 @@ from tcpipe.cost.labels import (
     touches_voltage_outside,
 )
 from tcpipe.fusion.densities import PRIORS
-from tcpipe.fusion.measurements import FIXES, IMU
+from tcpipe.fusion.measurements import IMU
 from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.distance_breakdown import find_interval_reason, sum_by_reason
@@ -175,7 +175,7 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> Mask:
     facts = info.report.facts
     times: list[tuple[int, int, int]] = []
     for section in facts.fuse.stretches if facts.fuse else ():
-        times += [(section.clock_epoch, r.start_ns, r.end_ns) for r in section.gate_resets if r.role in FIXES]
+        times += [(section.clock_epoch, r.start_ns, r.end_ns) for r in section.gate_resets]
         if not section.is_explained(*limits):
             times.append((section.clock_epoch, section.start_ns, section.end_ns))
     disputed = np.zeros(cut.num_rows, dtype=np.bool_)

@@ -71,9 +71,8 @@ class PowerSign:
 
 @dataclass(frozen=True, slots=True)
 class GateReset:
-    """Gate reset: rejected since ``start_ns``, accepted again at ``end_ns``, with an error ``size`` [m] or [m/s]."""
+    """Gate reset of fixes: rejected since ``start_ns``, accepted again at ``end_ns``, ``size`` off the track [m]."""
 
-    role: str
     start_ns: int
     end_ns: int
     size: float

@@ -120,7 +120,7 @@ def test_a_hole_counts_by_the_rows_on_both_of_its_sides(late, near):
 
 
 def disagreement(start_ns, end_ns, *, clock_epoch=0):
-    reset = GateReset("gnss", int(start_ns), int(end_ns), 1.0)
+    reset = GateReset(int(start_ns), int(end_ns), 1.0)
     stretch = StretchFacts({}, {}, {}, clock_epoch=clock_epoch, gate_resets=(reset,))
     return FuseFacts(200, ("gnss",), {}, {}, {}, {}, 0.0, (stretch,))
 
@@ -140,14 +140,6 @@ def test_a_disagreement_of_another_epoch_is_none():
     assert flags(later, about=info(fuse=disagreement(*span))) == set()
     assert flags(later, about=info(fuse=disagreement(*span, clock_epoch=1))) == {Quality.SENSORS_DISAGREE}
     assert flags(cut(), about=info(fuse=disagreement(STAMPS[120] + 1, STAMPS[130]))) == set()
-
-
-@pytest.mark.parametrize(("role", "disputed"), [("gnss", True), ("wheel_odometry", False)])
-def test_fixes_that_were_off_dispute_a_segment(role, disputed):
-    off = GateReset(role, int(STAMPS[110]), int(STAMPS[115]), 1.0)
-    stretch = StretchFacts({}, {}, {}, gate_resets=(off,))
-    fuse = FuseFacts(200, ("gnss",), {}, {}, {}, {}, 0.0, (stretch,))
-    assert (flags(cut(), about=info(fuse=fuse)) == {Quality.SENSORS_DISAGREE}) == disputed
 
 
 def streams(*, steps=(), **time_sources):
