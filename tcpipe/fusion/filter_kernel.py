@@ -499,8 +499,11 @@ def filter_ticks(
                 waits[kind, 0] += 1.0
                 if waits[kind, 0] >= 5.0 and waits[kind, 1] >= model.patience_s[kind]:
                     verdict = GateVerdict.RESET
-                    for e in range(Error.GYRO_BIAS):  # pose and velocity, whose σ becomes ten times as large
+                    for e in range(Error.GYRO_BIAS):  # σ of pose and velocity becomes ten times as large
                         P[e, e] *= 100.0
+                    measured = Error.RHO if kind == Kind.FIX else Error.THETA
+                    for i in range(3):
+                        P[measured + i, measured + i] += y[i] * y[i]
                     _compare(k, kind, inputs, model, x, P, acceleration, gain, room)
             tests.verdict[k, kind] = verdict
             if verdict == GateVerdict.REJECTED:

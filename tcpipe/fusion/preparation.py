@@ -62,15 +62,6 @@ class Prepared:
     findings: tuple[Finding, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Repeats:
-    """Measurements that repeat a value while the robot drives: first and last stamp [ns], and their number."""
-
-    start_ns: int
-    end_ns: int
-    messages: int
-
-
 def find_datum(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> tuple[float, float, float] | None:
     """Return longitude [deg], latitude [deg], height [m]: the median of the first ten fixes; None without fixes."""
     usable = np.flatnonzero(_is_fix(lon_deg, lat_deg, alt_m))[:10]
@@ -138,8 +129,10 @@ def _compute_rounding_variances(values: Floats) -> Floats:
     return np.asarray(steps.min() ** 2 * np.minimum(rows / 12.0, 1.0))
 
 
-def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tuple[Positions, tuple[Repeats, ...]]:
-    """Return the fixes without exact repetitions of the one before, and where these occur while the robot drives.
+def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tuple[Positions, list[list[int]]]:
+    """Return the fixes without exact repetitions of the one before, and those that occur while the robot drives.
+
+    The latter as first and last stamp [ns], and number of repetitions.
 
     They carry no information: a receiver hangs, or a slow one is published at a higher rate. Without odometry a robot
     may be stationary where fixes repeat for a second and two of their periods: they are kept. So are fixes that never
@@ -149,19 +142,19 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     changes = np.concatenate(([True], (np.diff(gnss.position_enu_m, axis=0) != 0.0).any(1)))
     first = np.flatnonzero(changes)
     if first.size < 2 or first.size == stamp_ns.size:
-        return gnss, ()
+        return gnss, []
     last = np.append(first[1:], stamp_ns.size) - 1
     kept_ns = stamp_ns[last] - stamp_ns[first]
     lasting = kept_ns >= max(1_000_000_000, 2 * compute_median_period_ns(stamp_ns[first]))  # less: a slow receiver
     if odometry is None:
         kept = changes | np.repeat(lasting, last - first + 1)
-        return (gnss if kept.all() else select_sensor_rows(gnss, kept)), ()
+        return (gnss if kept.all() else select_sensor_rows(gnss, kept)), []
     zero = int(stamp_ns[0])
     speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
     driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
     frozen = np.flatnonzero(lasting & (driven_m[last] - driven_m[first] > 0.2 * kept_ns * 1e-9))  # faster than 0.2 m/s
-    found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
-    return select_sensor_rows(gnss, changes), tuple(found)
+    found = np.stack((stamp_ns[first], stamp_ns[last], last - first), -1)[frozen].tolist()
+    return select_sensor_rows(gnss, changes), found
 
 
 def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Positions, Floats]:

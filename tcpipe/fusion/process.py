@@ -51,11 +51,6 @@ _MIN_DENSITY = 1e-4  # least density of velocity [m²/s³]: 1 cm/s in a second, 
 _UNKNOWN_DENSITY = 0.3  # density of velocity that no sensor shows [m²/s³]
 
 
-def is_turned_by_course(m: Measurements) -> bool:
-    """Return whether only the course over ground shows how the robot turns: fixes, and odometry without a yaw rate."""
-    return m.gnss is not None and m.imu is None and bool(m.odometries()) and not m.turning_odometries()
-
-
 def turn_scale_std(measurements: Measurements) -> float:
     """Return the standard deviation of the turn rate's scale: of the gyroscope, else of an odometry; else 0.
 
@@ -141,7 +136,7 @@ def _make_turn_density(
     """
     density = np.full((mode.size, 3), 5e-7)  # at least a tenth of a degree in a second
     ground = np.full(mode.size, 0.0 if m.is_antenna_alone else GROUND)
-    if is_turned_by_course(m):
+    if not noise.turns and m.odometries():  # only the course over ground shows turns
         density[:, 2] = 5e-3  # 4° in a second
     for role in noise.turns.keys() - {IMU}:
         rows = mode == (Mode.VISUAL_TURN if role == VISUAL else Mode.FLAT_TURN)

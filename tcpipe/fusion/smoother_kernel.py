@@ -56,8 +56,7 @@ class Smoothed(NamedTuple):
     states : x, (K, 51).
     variances : of the position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], (K, 5).
     links : variance of the horizontal displacement, along its direction, from a tick to the one each of the lags later
-        [m²], (K, l); NaN where it was not computed: it is at every `NEAR_EVERY` ticks, for lags beyond `NEAR` at every
-        `FAR_EVERY`.
+        [m²], (K, l); NaN where it was not computed: it is to every `LINK_EVERY`-th tick.
     spreads : standard deviation of every active error every `SELDOM` ticks, (K / SELDOM, n).
     """
 
@@ -67,7 +66,7 @@ class Smoothed(NamedTuple):
     spreads: Matrix
 
 
-NEAR, NEAR_EVERY, FAR_EVERY, SELDOM = 80, 4, 40, 100
+LINK_EVERY, SELDOM = 10, 100
 LARGEST_EVENT = 9
 """Errors that an event changes, at most."""
 
@@ -80,25 +79,21 @@ class Adjoint(NamedTuple):
     information : Λ, (n, n).
     rows : l, and for each of Q ticks ahead the columns of I - Λ P that belong to its position east and north, (1 + 2 Q,
     n).
-    ticks : of those ticks, (Q,); -1: none. Every `NEAR_EVERY` as far as `NEAR`, then every `FAR_EVERY` as far as the
-    longest lag.
+    ticks : of those ticks, (Q,); -1: none. Every `LINK_EVERY` as far as the longest lag.
     ends : of those ticks, position east and north, and their smoothed covariance (ee, en, nn), (Q, 5).
-    near : so many of Q are those up to `NEAR`.
     """
 
     information: Matrix
     rows: Matrix
     ticks: Indices
     ends: Matrix
-    near: int
 
 
 def make_adjoint(size: int, longest: int) -> Adjoint:
     """Return the adjoint at the last tick, of ``size`` errors, for lags up to ``longest`` ticks (0: none)."""
-    near = NEAR // NEAR_EVERY + 1 if longest else 0
-    ahead = near + longest // FAR_EVERY + 1 if longest else 0
+    ahead = longest // LINK_EVERY + 1 if longest else 0
     rows = np.zeros((1 + 2 * ahead, size))
-    return Adjoint(np.zeros((size, size)), rows, np.full(ahead, -1, np.int64), np.zeros((ahead, 5)), near)
+    return Adjoint(np.zeros((size, size)), rows, np.full(ahead, -1, np.int64), np.zeros((ahead, 5)))
 
 
 @compile_kernel
@@ -210,7 +205,7 @@ def _smooth_tick(
     room: Any,
 ) -> None:
     """Fill the smoothed estimate at tick k."""
-    information, rows, ticks, ends, near = adjoint
+    information, rows, ticks, ends = adjoint
     d, turn, c, after = room
     n = P.shape[0]
     d[:] = 0.0
@@ -277,10 +272,8 @@ def _smooth_tick(
                     s += share[axis + other] * v
             s /= east * east + north * north + 2.0 * short
             out.links[k, column] = max(s, 0.0)
-    if ticks.size and k % NEAR_EVERY == 0:
-        q = (k // NEAR_EVERY) % near
-        if k % FAR_EVERY == 0:
-            q = near + (k // FAR_EVERY) % (ticks.size - near)
+    if ticks.size and k % LINK_EVERY == 0:
+        q = (k // LINK_EVERY) % ticks.size
         ticks[q] = k
         ends[q, 0], ends[q, 1] = out.states[k, 9], out.states[k, 10]
         for axis in range(2):

@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 from tcpipe.arrays import Floats, Ints
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
-from tcpipe.fusion.course import compute_course_rate
 from tcpipe.fusion.densities import PRIORS, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory, Tests, TickInputs
-from tcpipe.fusion.measurements import NO_TRUST, VISUAL, WHEELS, BodyVelocities, Measurements
+from tcpipe.fusion.level_motion import COURSE, get_turn_rates
+from tcpipe.fusion.measurements import IMU, NO_TRUST, VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import (
     UNSEEN_TURN_RADPS,
-    is_turned_by_course,
     make_motion_noise,
 )
 from tcpipe.fusion.signals import (
@@ -314,36 +313,18 @@ def _compute_slope(source: BodyVelocities, stamp_ns: Ints) -> Floats:
 
 def _find_turn_rates(m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int) -> tuple[Floats, NDArray[np.int8]]:
     """Return the mean angular velocity over each interval by the best source that covers it, and its mode of motion."""
-    imu = m.imu
-    if imu is None:
-        return _compute_odometric_turn_rate(m, before_ns, after_ns, zero_ns)
-    covered = is_covered(imu.stamp_ns, before_ns, after_ns)
-    rate, mode = np.zeros((before_ns.size, 3)), np.full(before_ns.size, Mode.GYRO_TURN, np.int8)
-    rate[covered] = compute_interval_means(
-        compute_seconds(imu.stamp_ns, zero_ns),
-        imu.angular_velocity_radps,
-        *(compute_seconds(each[covered], zero_ns) for each in (before_ns, after_ns)),
-    )
-    rate[~covered], mode[~covered] = _compute_odometric_turn_rate(m, before_ns[~covered], after_ns[~covered], zero_ns)
-    return rate, mode
-
-
-def _compute_odometric_turn_rate(
-    m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int
-) -> tuple[Floats, NDArray[np.int8]]:
-    """Return the mean angular velocity by odometries (K, 3), or the course if it is alone, and the mode."""
-    rate = np.zeros((before_ns.size, 3))
-    mode = np.full(before_ns.size, Mode.FLAT_TURN, np.int8)
+    rate, mode = np.zeros((before_ns.size, 3)), np.full(before_ns.size, Mode.FLAT_TURN, np.int8)
     start_s, end_s = compute_seconds(before_ns, zero_ns), compute_seconds(after_ns, zero_ns)
-    if m.gnss is not None and is_turned_by_course(m):
-        stamp_s, values = compute_course_rate(m.gnss, m.first_odometry, zero_ns)
-        rate[:, 2] = compute_interval_means(stamp_s, values[:, None], start_s, end_s)[:, 0]
-    for rank, source in enumerate(m.turning_odometries().values()):
-        known = np.isfinite(source.yaw_rate_radps)
-        turns = source.turn_rate_radps
-        values = np.stack((0 * source.yaw_rate_radps,) * 2 + (source.yaw_rate_radps,), -1) if turns is None else turns
-        inside = is_covered(source.stamp_ns[known], before_ns, after_ns) | (rank == 0)
-        stamp_s = compute_seconds(source.stamp_ns[known], zero_ns)
-        rate[inside] = compute_interval_means(stamp_s, values[known], start_s[inside], end_s[inside])
-        mode[inside] = Mode.VISUAL_TURN if source is m.visual else Mode.FLAT_TURN
+    roles = [*m.turning_odometries(), *([] if m.imu is None else [IMU])]
+    if not roles and m.gnss is not None and m.odometries():
+        roles = [COURSE]
+    for role in roles:
+        stamp_ns, values = get_turn_rates(m, role)
+        inside = is_covered(stamp_ns, before_ns, after_ns)
+        if role == roles[0] != IMU:  # in its gaps nothing better is known
+            inside[:] = True
+        rate[inside] = compute_interval_means(
+            compute_seconds(stamp_ns, zero_ns), values, start_s[inside], end_s[inside]
+        )
+        mode[inside] = {IMU: Mode.GYRO_TURN, VISUAL: Mode.VISUAL_TURN}.get(role, Mode.FLAT_TURN)
     return rate, mode

@@ -71,7 +71,7 @@ def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pas
                 since.append(k)
                 if len(since) >= 5 and (k - since[0]) * period_s >= model.patience_s[kind]:
                     verdict = GateVerdict.RESET
-                    ukf.inflate()
+                    ukf.inflate(kind, innovation)
                     ukf.update(k, kind, np.inf)
             if verdict != GateVerdict.REJECTED:
                 rejected[kind].clear()
@@ -152,10 +152,12 @@ class _Filter:
             self._correct()
         return ukf.y, nis
 
-    def inflate(self) -> None:
-        """Make σ of pose and velocity ten times as large."""
+    def inflate(self, kind: int, innovation: Floats) -> None:
+        """Inflate pose and velocity as `filter_ticks` does."""
         angles, moving = range(Error.RHO), range(Error.GYRO_BIAS)
+        measured = range(Error.RHO, Error.U) if kind == Kind.FIX else angles
         self._ukf.P[moving, moving] *= 100.0
+        self._ukf.P[measured, measured] += np.square(innovation)
         self._ukf.P[angles, angles] = np.minimum(self._ukf.P[angles, angles], _MAX_ANGLE_STD_RAD**2)
 
     def compute_variances(self) -> Floats:

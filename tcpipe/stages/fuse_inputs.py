@@ -138,9 +138,9 @@ def _prepare_section(
         repeated = prepared[GNSS].repeated + gnss.stamp_ns.size
         gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
         prepared[GNSS] = replace(prepared[GNSS], repeated=repeated - gnss.stamp_ns.size)
-        for each in repeats:
-            span_s, frozen = find_span_s(each.start_ns, each.end_ns, streams), {"quantity": "position"}
-            findings.append(make_finding("frozen", fixes, span_s=span_s, names=frozen, message_count=each.messages))
+        for start_ns, end_ns, count in repeats:
+            span_s, frozen = find_span_s(start_ns, end_ns, streams), {"quantity": "position"}
+            findings.append(make_finding("frozen", fixes, span_s=span_s, names=frozen, message_count=count))
     if gnss is not None and odometry is not None:
         gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
         if (jumpy := jitter_s > 0).any():

@@ -83,14 +83,14 @@ def test_facts_name_what_the_sensors_were():
 
 def test_outliers_are_refused_and_listed():
     found = smoothed()
-    role = found.rejections.role
+    role = found.rejections["role"]
     assert found.facts.rejected == {r: int((role == r).sum()) for r in (GNSS, WHEELS, VISUAL)}
     # 2 % of the fixes were thrown 1.5 m away in each axis; a few of them land near enough to pass.
     assert 15 <= found.facts.rejected[GNSS] <= 50
-    assert (np.diff(found.rejections.stamp_ns) >= 0).all()
-    assert (found.rejections.normalized_innovation_squared > found.rejections.threshold).all()
-    assert found.rejections.threshold[role == GNSS] == pytest.approx(16.266, abs=1e-3)
-    assert found.rejections.threshold[role == WHEELS] == pytest.approx(10.828, abs=1e-3)
+    assert (np.diff(found.rejections["stamp_ns"]) >= 0).all()
+    assert (found.rejections["normalized_innovation_squared"] > found.rejections["threshold"]).all()
+    assert found.rejections["threshold"][role == GNSS] == pytest.approx(16.266, abs=1e-3)
+    assert found.rejections["threshold"][role == WHEELS] == pytest.approx(10.828, abs=1e-3)
 
 
 @pytest.mark.parametrize(

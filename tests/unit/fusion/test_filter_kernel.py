@@ -7,14 +7,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from unit.fusion import se3_reference as reference
 
-from tcpipe.fusion import error_state, smoother_kernel, state
+from tcpipe.fusion import error_state, state
 from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
 from tcpipe.fusion.filter_kernel import GateVerdict, Memory, TickInputs, allocate_steps, filter_ticks
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
 from tcpipe.fusion.smoother_kernel import (
-    FAR_EVERY,
-    NEAR_EVERY,
+    LINK_EVERY,
     Adjoint,
     Candidates,
     Smoothed,
@@ -281,7 +280,6 @@ class Problem:
 @pytest.mark.parametrize("mode", MODES)
 def test_filter_and_smoother_solve_the_least_squares_problem_of_all_ticks(monkeypatch, mode):
     monkeypatch.setattr(error_state, "_BLOCK", 17)
-    monkeypatch.setattr(smoother_kernel, "NEAR", 20)
     problem = Problem(11, mode)
     found = problem.smooth()
     states, maps, covariance = problem.solve()
@@ -306,8 +304,8 @@ def test_filter_and_smoother_solve_the_least_squares_problem_of_all_ticks(monkey
         assert (by_turn @ turned @ covariance @ turned.T @ by_turn.T)[0, 0] == pytest.approx(
             found.variances[k, 3], rel=0.02
         )
-        for column, (lag, every) in enumerate(((10, NEAR_EVERY), (20, NEAR_EVERY), (40, FAR_EVERY))):
-            if k + lag >= len(maps) or (k + lag) % every:
+        for column, lag in enumerate((10, 20, 40)):
+            if k + lag >= len(maps) or (k + lag) % LINK_EVERY:
                 assert np.isnan(found.links[k, column])
                 continue
             after = states[k + lag][:9].reshape(3, 3) @ maps[k + lag][3:6]
@@ -465,7 +463,7 @@ def test_rounding_of_the_smoothers_information_does_not_grow():
         filtered[k] = covariance
         covariance = covariance + np.diag(noise)
     information = np.zeros((n, n))
-    adjoint = Adjoint(information, np.zeros((1, n)), np.full(0, -1), np.zeros((0, 5)), 0)
+    adjoint = Adjoint(information, np.zeros((1, n)), np.full(0, -1), np.zeros((0, 5)))
     turn, places, room = np.tile(np.eye(3).ravel(), 2), np.arange(3), np.zeros((n, 2 * n + 3))
     for k in range(ticks - 1, -1, -1):
         smoothed = filtered[k] - filtered[k] @ information @ filtered[k]

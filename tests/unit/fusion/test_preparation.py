@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from tcpipe.fusion.measurements import STATED_ARM_STD_M, BodyVelocities, Positions
 from tcpipe.fusion.preparation import (
-    Repeats,
     drop_repeated_fixes,
     find_datum,
     prepare_body_velocities,
@@ -247,7 +246,7 @@ def test_fixes_that_hang_while_the_robot_drives_are_left_out_and_named():
     found, repeats = drop_repeated_fixes(gnss, wheels)
     assert found.stamp_ns.tolist() == np.delete(gnss.stamp_ns, range(30, 51)).tolist()
     assert found.unclaimed.sum() == 49
-    assert repeats == (Repeats(int(gnss.stamp_ns[29]), int(gnss.stamp_ns[50]), 21),)
+    assert repeats == [[int(gnss.stamp_ns[29]), int(gnss.stamp_ns[50]), 21]]
 
 
 @pytest.mark.parametrize("often", [2, 12])
@@ -257,13 +256,13 @@ def test_a_slow_receiver_that_is_published_more_often_is_slow(often):
     for odometry in (wheels, None):
         found, repeats = drop_repeated_fixes(gnss, odometry)
         assert found.stamp_ns.tolist() == gnss.stamp_ns[::often].tolist()
-        assert repeats == ()
+        assert repeats == []
 
 
 def test_fixes_of_a_stationary_robot_may_repeat():
     gnss, wheels = driven_fixes(range(30, 51))
     at_rest = replace(wheels, velocity_mps=0.0 * wheels.velocity_mps)
-    assert drop_repeated_fixes(gnss, at_rest)[1] == ()
-    assert drop_repeated_fixes(gnss, None) == (gnss, ())
+    assert drop_repeated_fixes(gnss, at_rest)[1] == []
+    assert drop_repeated_fixes(gnss, None) == (gnss, [])
     never = replace(gnss, position_enu_m=np.zeros((100, 3)))
-    assert drop_repeated_fixes(never, wheels) == (never, ())
+    assert drop_repeated_fixes(never, wheels) == (never, [])
