@@ -25,7 +25,6 @@ from tcpipe.fusion.signals import (
     compute_median_period_ns,
     compute_moving_mean,
     compute_seconds,
-    multiply_by_vector,
     remove_spikes,
     solve_least_squares,
 )
@@ -342,30 +341,12 @@ class _Alignment:
         return fit
 
     def make_track(self, forward: Floats, fit: _Fit) -> OdometryTrack:
-        """Return the aligned track, its pitch corrected by the fixes' heights."""
+        """Return the aligned track."""
         velocity, arm = self._horizontal(forward, fit)
         speed = fit.scale * forward
         climb = speed * self._attitude.rotation[:, 2, 0]
-        if self._attitude.is_level:
-            climb = climb + speed * self._fit_pitch(speed, climb)
         path = integrate_grid(np.stack((velocity.real, velocity.imag, climb), -1))
         level = np.abs(velocity) * np.sign(speed)
         heading = self._attitude.yaw_rad + fit.turn_rad
         placed = np.stack((arm.real, arm.imag, self._arm_m[:, 2]), -1)
         return OdometryTrack(level, heading, path, placed, fit.turn_std_rad)
-
-    def _fit_pitch(self, speed: Floats, climb: Floats) -> Floats:
-        """Return the slow error of pitch [rad] on the grid (n,) with which the track climbs as the fixes do."""
-        # An accelerometer's bias, 0.1 rad (1σ), is another one after 240 s.
-        knots_s = np.linspace(0.0, self._knots_s[-1], max(2, round(float(self._knots_s[-1]) / 240.0) + 1))
-        hats = np.maximum(0.0, 1.0 - np.abs(self._middle_s[:, None] - knots_s) / knots_s[1])
-        path = self._difference(integrate_grid(speed)).real
-        rise = self._moved_m[:, 2] - self._difference(integrate_grid(climb) + self._arm_m[:, 2]).real
-        matrix, pitch = hats * path[:, None], np.zeros(knots_s.size)
-        for _ in range(_ROUNDS):
-            off = rise - multiply_by_vector(matrix, pitch)
-            noise = float(np.median(np.abs(off))) + 1e-9
-            root = 1.0 / (1.0 + np.square(off / (2.5 * noise)))
-            rows = np.concatenate((matrix * root[:, None], np.eye(knots_s.size) * (noise / 0.1)))  # σ of pitch 0.1 rad
-            pitch = solve_least_squares(rows, np.concatenate((rise * root, np.zeros(knots_s.size))))
-        return np.interp(self._attitude.time_s, knots_s, pitch)
