@@ -499,11 +499,11 @@ def filter_ticks(
                 waits[kind, 0] += 1.0
                 if waits[kind, 0] >= 5.0 and waits[kind, 1] >= model.patience_s[kind]:
                     verdict = GateVerdict.RESET
-                    for e in range(Error.GYRO_BIAS):  # σ of pose and velocity becomes ten times as large
-                        P[e, e] *= 100.0
                     measured = Error.RHO if kind == Kind.FIX else Error.THETA
                     for i in range(3):
                         P[measured + i, measured + i] += y[i] * y[i]
+                        P[Error.U + i, Error.U + i] += 0.3**2  # m/s: as at the start
+                    P[Error.THETA + 2, Error.THETA + 2] += 0.1**2  # rad
                     _compare(k, kind, inputs, model, x, P, acceleration, gain, room)
             tests.verdict[k, kind] = verdict
             if verdict == GateVerdict.REJECTED:

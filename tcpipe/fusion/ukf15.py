@@ -154,10 +154,12 @@ class _Filter:
 
     def inflate(self, kind: int, innovation: Floats) -> None:
         """Inflate pose and velocity as `filter_ticks` does."""
-        angles, moving = range(Error.RHO), range(Error.GYRO_BIAS)
-        measured = range(Error.RHO, Error.U) if kind == Kind.FIX else angles
-        self._ukf.P[moving, moving] *= 100.0
-        self._ukf.P[measured, measured] += np.square(innovation)
+        measured = Error.RHO if kind == Kind.FIX else Error.THETA
+        added, angles = np.zeros(Error.GYRO_BIAS), range(Error.RHO)
+        added[measured : measured + 3] = innovation @ innovation
+        added[Error.U :] = 0.3**2  # m/s: as at the start
+        added[Error.THETA + 2] += _MAX_ANGLE_STD_RAD**2
+        self._ukf.P[range(added.size), range(added.size)] += added
         self._ukf.P[angles, angles] = np.minimum(self._ukf.P[angles, angles], _MAX_ANGLE_STD_RAD**2)
 
     def compute_variances(self) -> Floats:
