@@ -10,22 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import NoiseModel
 from tcpipe.fusion.filter_kernel import GateVerdict, Tests
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS
-from tcpipe.fusion.pair_residuals import ACROSS, ALONG, Residuals
 from tcpipe.fusion.parameters import FIX_AXES, Event
 from tcpipe.fusion.signals import SPIKE_RATIO, compute_running_median
 from tcpipe.fusion.state import Error, Kind
-from tcpipe.fusion.ticks import Ticks
-from tcpipe.robust import MIN_SIGMAS
+from tcpipe.fusion.ticks import Ticks, compute_process_noise
 from tcpipe.tables.findings import read_threshold
 
 ROLES: Mapping[int, str] = {
@@ -140,19 +136,14 @@ class Change:
 
     def alter_ticks(self, ticks: Ticks) -> Ticks:
         """Return the ticks as they are under the change."""
-        if self.kind not in {"noise", "wander"}:
+        if self.kind != "noise":
             return ticks
-        inputs = ticks.inputs
-        kept, noise, variance = inputs.fix_kept.copy(), inputs.fix_noise.copy(), ticks.fix_variance_m2.copy()
-        first, last = self.first, kept.size if self.last is None else self.last
-        if self.kind == "noise":
-            kept[:] = np.exp(-inputs.period_s / 1.5)  # s: reflected signals change as the antenna moves by a metre
-        variance[first:last] = np.maximum(variance[first:last], np.square(self.size * FIX_AXES))
-        if last < kept.size:
-            kept[last] *= np.sqrt(variance[last, 0] / variance[last - 1, 0])
-        earlier = np.concatenate((variance[:1], variance[:-1]))
-        noise[first:] = np.maximum(variance - kept[:, None] ** 2 * earlier, 0.0)[first:]
-        return replace(ticks, inputs=inputs._replace(fix_kept=kept, fix_noise=noise), fix_variance_m2=variance)
+        # Reflected signals change as the antenna moves by a metre.
+        kept = np.full_like(ticks.inputs.fix_kept, np.exp(-ticks.inputs.period_s / 1.5))
+        variance = np.maximum(ticks.fix_variance_m2, np.square(self.size * FIX_AXES))
+        noise = compute_process_noise(kept, variance)
+        inputs = ticks.inputs._replace(fix_kept=kept, fix_noise=noise)
+        return replace(ticks, inputs=inputs, fix_variance_m2=variance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,55 +251,3 @@ def compute_evidence(tests: Tests, gates: Floats) -> float:
     """Return the log likelihood of all measurements; one beyond the gate counts as the gate."""
     kinds = [Kind.WHEELS, Kind.VISUAL, Kind.DOPPLER, Kind.FIX, Kind.ATTITUDE]
     return float(-0.5 * np.nansum(np.minimum(tests.nis[:, kinds], gates[kinds]) + tests.log_det[:, kinds]))
-
-
-_EXCURSION_WINDOW_S = 8.0
-"""Longest window of a step, or of a wrong lever arm in a turn [s]."""
-
-
-def find_excursions(residuals: Sequence[Residuals], noise: NoiseModel, ticks: Ticks) -> tuple[Change, ...]:
-    """Return the spans in which fixes moved otherwise than two odometries alike, far beyond the noise of the section.
-
-    A step at t is beyond in every window that holds t, an excursion only in windows as long as itself: where short
-    windows are farther beyond, there is a step.
-    """
-    size = ticks.stamp_ns.size
-    # Windows of 4 s or less are too short to compare.
-    of_fixes = [each for each in residuals if GNSS in each.pair and each.time_s > 4.0]
-    found = sorted(
-        (run for pair in combinations(of_fixes, 2) for run in _find_excursion_runs(*pair, noise)), reverse=True
-    )
-    spans: list[tuple[int, int, float]] = []
-    for place, (_, time_s, start_ns, end_ns, off_m) in enumerate(found):
-        steps = [run for run in found[:place] if run[1] <= _EXCURSION_WINDOW_S]
-        if time_s > _EXCURSION_WINDOW_S and not any(run[2] < (start_ns + end_ns) // 2 < run[3] for run in steps):
-            spans.append((*np.searchsorted(ticks.stamp_ns, (start_ns, end_ns)).clip(0, size).tolist(), off_m))
-    changes: list[Change] = []
-    for first, last, off_m in sorted(spans):
-        before = changes.pop() if changes and first < (changes[-1].last or size) else Change("wander", Kind.FIX, first)
-        end, largest_m = max(last, before.last or 0), max(off_m, before.size)
-        changes.append(replace(before, last=None if end >= size else end, size=largest_m))
-    return tuple(changes)
-
-
-def _find_excursion_runs(
-    one: Residuals, other: Residuals, noise: NoiseModel
-) -> Iterator[tuple[float, float, int, int, float]]:
-    """Yield z², length [s], start and end [ns] and size [m] of each run of windows that both pairs contradict alike."""
-    if one.axis not in {ALONG, ACROSS} or one.axis != other.axis or abs(one.time_s / other.time_s - 1.0) > 0.1:
-        return
-    start_ns, *rows = np.intersect1d(one.start_ns, other.start_ns, return_indices=True)
-    value, variance = np.empty((2, 2, start_ns.size))
-    for k, each in enumerate((one, other)):
-        densities = noise.densities.get(each.axis, {})
-        sums = sum(
-            (densities.get(name, 0.0) * factor for name, factor in each.features.items()), np.zeros(each.value.size)
-        )
-        value[k], variance[k] = each.value[rows[k]], sums[rows[k]] + 1e-6  # m²: without densities there is none
-    z2, ratio = (value**2 / variance).max(axis=0), value[0] / np.where(value[1], value[1], np.inf)
-    beyond = np.flatnonzero((z2 > MIN_SIGMAS**2) & (ratio < 2.0) & (ratio > 0.5))  # both odometries confirm each other
-    end_ns = one.end_ns[rows[0]]
-    for run in np.split(beyond, np.flatnonzero(start_ns[beyond][1:] >= end_ns[beyond][:-1]) + 1):
-        if run.size >= 3:  # windows that overlap
-            off_m = float(np.abs(value[0, run]).max())
-            yield float(z2[run].max()), one.time_s, int(start_ns[run[0]]), int(end_ns[run[-1]]), off_m

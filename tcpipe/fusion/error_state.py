@@ -30,7 +30,6 @@ from tcpipe.fusion.changes import (
     Hypothesis,
     compute_evidence,
     drop_outliers,
-    find_excursions,
     is_contradicted,
     join_events,
 )
@@ -50,7 +49,7 @@ from tcpipe.fusion.measurements import (
     Measurements,
     Trajectory,
 )
-from tcpipe.fusion.pair_residuals import Residuals, find_residuals
+from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, find_walk, make_model, make_priors, make_start, widen_start
 from tcpipe.fusion.process import GROUND, SLOPE_RAD, UNSEEN_TURN_RADPS, find_best_scale_std, is_length_observable
 from tcpipe.fusion.smoother_kernel import LARGEST_EVENT, SELDOM, Candidates, Smoothed, make_adjoint, smooth_ticks
@@ -127,19 +126,17 @@ def prepare_section(m: Measurements, output_ns: Ints, gate_probability: float) -
     start_ns = [int(sensor.stamp_ns[0]) for role, sensor in m.sensors().items() if role != IMU]
     first_ns, last_ns = min([*start_ns, int(output_ns[0])]), int(output_ns[-1])
     ticks = build_ticks(m, noise, standing, first_ns, last_ns, output_ns=output_ns)
-    return SectionModel(m, residuals, noise, ticks, make_priors(m, noise, ticks)[0], gate_probability)
+    return SectionModel(m, noise, ticks, make_priors(m, noise, ticks)[0], gate_probability)
 
 
 @dataclass(frozen=True, slots=True)
 class SectionModel:
     """A section as estimators take it, under one hypothesis or another.
 
-    ``residuals`` are of the pairs of sensors, ``std`` is the standard deviation of every error before the measurements,
-    shape (45,).
+    ``std`` is the standard deviation of every error before the measurements, shape (45,).
     """
 
     measurements: Measurements
-    residuals: Sequence[Residuals]
     noise: NoiseModel
     ticks: Ticks
     std: Floats
@@ -212,17 +209,13 @@ class SectionModel:
     def explain(self, made: Pass, events: Sequence[Change], start: Memory) -> Hypothesis:
         """Return the changes that explain most of where sensors contradict each other, none where they do not.
 
-        ``events`` explain much of the pass ``made``. Smooth errors of fixes, which the filter follows, need no
-        contradiction.
+        ``events`` explain much of the pass ``made``.
         """
         period_s, most = self.ticks.inputs.period_s, read_threshold("changes-unlikely", "max_change_count")
-        excursions = find_excursions(self.residuals, self.noise, self.ticks)
-        if not events and not excursions and not is_contradicted(made.tests, period_s):
+        if not events and not is_contradicted(made.tests, period_s):
             return _UNCHANGED
         plain, tests = self._judge((), start)
         best, tests_of_best = self._add_events(plain, tests, start)
-        if not best.changes and not is_contradicted(tests, period_s):
-            return Hypothesis(excursions)
         if len(best.changes) <= most and not is_contradicted(tests_of_best, period_s):
             return best
         # Errors may be larger than usual throughout: many changes would explain that, too.

@@ -189,7 +189,13 @@ def _make_fix_process(noise: NoiseModel, variance_m2: Floats, period_s: float) -
     before = np.concatenate((variance_m2[:1], variance_m2[:-1]))
     shrunk = np.sqrt(np.minimum(1.0, variance_m2[:, 0] / np.maximum(before[:, 0], 1e-12)))
     kept = np.exp(-period_s / noise.horizontal.correlated.time_s) * shrunk
-    return kept, np.maximum(variance_m2 - kept[:, None] ** 2 * before, 0.0)
+    return kept, compute_process_noise(kept, variance_m2)
+
+
+def compute_process_noise(kept: Floats, variance: Floats) -> Floats:
+    """Return what is added over each tick to a process of this variance, (K, 3), of which the share ``kept`` stays."""
+    before = np.concatenate((variance[:1], variance[:-1]))
+    return np.maximum(variance - kept[:, None] ** 2 * before, 0.0)
 
 
 def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: NoiseModel, role: str) -> Floats:

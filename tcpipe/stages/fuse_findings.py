@@ -138,7 +138,6 @@ def _find_weak_sensors(facts: FuseFacts) -> Iterator[Finding]:
 
 CHANGES = {
     "offset": "positions are off by {:.2f} m",
-    "wander": "positions err smoothly, by up to {:.2f} m",
     "step": "positions step by {:.2f} m, and nothing shows which side is right",
     "noise": "positions err by {:.2f} m (1σ), more than they claim",
     "slow": "positions err slowly by {:.2f} m (1σ), more than they claim",

@@ -78,7 +78,7 @@ class GateReset:
     size: float
 
 
-FIX_ERRORS = frozenset({"noise", "slow", "wander", "step"})
+FIX_ERRORS = frozenset({"noise", "slow", "step"})
 """Kinds of changes that only increase the errors of fixes."""
 
 

@@ -152,15 +152,6 @@ def test_no_side_of_a_step_of_fixes_is_believed(share):
     assert drms_m[t > 120.0].min() > 0.47 * 0.3
 
 
-def test_fixes_that_two_odometries_contradict_smoothly_are_an_excursion():
-    def bump(t):
-        return 0.4 * np.sin(np.pi * np.clip((t - 55.0) / 40.0, 0.0, 1.0)) ** 2
-
-    found = fuse(shift(drive.measure(truth(), 1, slip=0.02), bump))
-    assert {(change.kind, change.role) for change in found.facts.changes} == {("wander", "gnss")}
-    assert drive.errors(truth(), found)["max_xy"] < 0.2
-
-
 def test_nothing_happened_in_a_clean_run():
     assert smoothed().facts.changes == ()
     assert smoothed(imu=False).facts.changes == ()

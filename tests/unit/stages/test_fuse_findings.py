@@ -43,16 +43,16 @@ def test_changes_are_findings_in_order_of_time():
     def change(kind, start_s, end_s, size):
         return ChangeFacts(kind, "gnss", round(start_s * 1e9), round(end_s * 1e9), size)
 
-    first = (change("antenna", 30, 60, 0.2), change("wander", 5, 80, 0.7))
+    first = (change("antenna", 30, 60, 0.2), change("slow", 5, 80, 0.7))
     findings = warned(
-        Section(0, datum_deg_m=PLACE), stretch(changes=first), stretch(changes=(change("wander", 90, 95, 0.1),))
+        Section(0, datum_deg_m=PLACE), stretch(changes=first), stretch(changes=(change("slow", 90, 95, 0.1),))
     )
     found = [(each.span_s, each.names["change"]) for each in findings if each.code == "sensor-changed"]
-    smooth = "positions err smoothly, by up to {} m"
+    slow = "positions err slowly by {} m (1σ), more than they claim"
     assert found == [
-        ((5.0, 80.0), smooth.format("0.70")),
+        ((5.0, 80.0), slow.format("0.70")),
         ((30.0, 60.0), "it was moved by 0.20 m on the robot"),
-        ((90.0, 95.0), smooth.format("0.10")),
+        ((90.0, 95.0), slow.format("0.10")),
     ]
 
 
