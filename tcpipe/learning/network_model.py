@@ -50,7 +50,7 @@ _SLOWER = 0.1
 """Factor of the learning rate when the loss stops falling."""
 
 _SECONDS_BETWEEN = 60.0
-"""Training that a crash or an interruption loses at most, beyond an epoch [s]."""
+"""Training that a crash loses at most, beyond an epoch [s]; an interruption loses only the epoch in which it occurs."""
 
 _LAST = 0.8
 """Share of the maximum of epochs after which the rate is smaller in any case."""
@@ -85,18 +85,20 @@ class _State:
     progress: TrainingProgress
     best: dict[str, Any]
     """Weights of the best epoch."""
+    packed: bytes = b""
+    """The state at the end of the last epoch."""
     written_s: float = float("-inf")
 
     def keep(self, path: Path) -> None:
-        """Write the state if the last one was written long ago."""
+        """Pack the state; write it if the last one was written long ago."""
+        self.packed = self.trainer.pack_state({"progress": asdict(self.progress), "best": self.best})
         if time.monotonic() - self.written_s > _SECONDS_BETWEEN:
             self.write(path)
 
     def write(self, path: Path) -> None:
-        """Write the state, whole or not at all."""
+        """Write the packed state, whole or not at all."""
         with write_atomic_file(path) as temporary:
-            packed = self.trainer.pack_state({"progress": asdict(self.progress), "best": self.best})
-            temporary.write_bytes(packed)
+            temporary.write_bytes(self.packed)
         self.written_s = time.monotonic()
 
     def read(self, path: Path) -> None:
@@ -137,7 +139,7 @@ class NetworkModel(Predictor):
         """Train until the loss of the held-out fold stops falling, and return the network with the smallest.
 
         ``job.checkpoint``, from which training continues, is the state at the end of an epoch. It is written before the
-        first epoch, after the last one, and every `_SECONDS_BETWEEN`.
+        first epoch, on interruption, and every `_SECONDS_BETWEEN`.
         """
         is_held = samples.folds == samples.config.fold
         fit, held = samples.take(~is_held), samples.take(is_held)
@@ -149,8 +151,13 @@ class NetworkModel(Predictor):
             state.read(job.checkpoint)
             logger.info("%s: resumes after epoch %d", job.name, state.progress.epoch)
         state.keep(job.checkpoint)  # a place that cannot be written is found now, not after an epoch
-        cls._fit_until_best(model, state, fit, held, job, times)
-        state.write(job.checkpoint)  # later steps may fail
+        try:
+            cls._fit_until_best(model, state, fit, held, job, times)
+            state.write(job.checkpoint)  # later steps may fail
+        except BaseException as error:
+            if not isinstance(error, Exception):  # the user, or a signal
+                state.write(job.checkpoint)
+            raise
         trainer.network.load_state_dict(state.best)
         progress, held_out = state.progress, Prediction.without_covariance(np.full(samples.labels.shape, np.nan))
         held_out.mean[is_held] = predict_samples(model, held).mean
