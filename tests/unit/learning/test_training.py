@@ -128,6 +128,23 @@ def test_a_training_stopped_after_any_checkpoint_goes_on_as_if_nothing_had_happe
     assert not checkpoint.exists()
 
 
+def test_an_interruption_writes_the_last_whole_epoch(dataset, tmp_path, monkeypatch, caplog):
+    real = network_model._State.keep
+
+    def keep_and_stop(state, path):
+        real(state, path)
+        if state.progress.epoch == 1:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(network_model._State, "keep", keep_and_stop)
+        with pytest.raises(KeyboardInterrupt):
+            train(dataset, tmp_path / "model", config=CONFIG)
+    with caplog.at_level("INFO", "tcpipe"):
+        train(dataset, tmp_path / "model", config=CONFIG)
+    assert "resumes after epoch 1" in caplog.text
+
+
 def test_a_state_of_another_training_is_kept_and_one_cut_short_is_told(dataset, tmp_path, monkeypatch):
     place, config = tmp_path / "other", replace(CONFIG, epochs=1)
     _stopped(monkeypatch, 0, dataset, place, config)
@@ -204,6 +221,7 @@ def test_a_damaged_one_is_told_or_as_it_was(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("state") / "model.checkpoint"
     state, again = _make_state(), _make_state()
     state.progress = network_model.TrainingProgress(1, 0, float("inf"), [(1, 0.5, float("nan"))])
+    state.keep(path)
     state.write(path)
     raw = bytearray(path.read_bytes())
     at = data.draw(st.integers(0, len(raw) - 1))
