@@ -90,7 +90,6 @@ PRIORS = {
     # rad²: what the alignment leaves of heading and pitch; roll and pitch where no accelerometer measures them.
     "heading scale": GaussMarkov(0.005**2, 30.0),
     "pitch scale": GaussMarkov(0.0015**2, 30.0),
-    "stamp": GaussMarkov(0.003**2),  # s²: time stamps of fixes, which err by as much times the velocity
     # rad²/s beside the noise that the samples show.
     "imu turn": GaussMarkov(1e-8),
     "wheel_odometry turn": GaussMarkov(1e-5),
@@ -122,7 +121,6 @@ _FEWEST = 8  # fewest windows of a cell [1]
 _MAX_VARIANCE_RATIO = 1.5  # shown over stated variance of fixes without claims [1]; above it the shown one counts
 _CODE_PHASE_M2 = 1.5**2  # variance of each axis [m²]; GPS Standard Positioning Service, Performance Standard 2020
 _PROCESS_STD = 0.6  # 1σ of the share of the claim [1] that one correlation time has
-_MOVING_STD = 0.02  # the same of errors that are there only while the robot moves
 _AXES_STD = 0.25  # 1σ of the difference of processes in the plane and of heights [1], by their total
 _MAX_PRIOR_GROWTH = 25.0  # largest factor [1] by which a prior's standard deviation grows with the density
 _ROUNDING = 1e-10  # variance of rounding [m²]
@@ -159,11 +157,11 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
     horizontal = prior.horizontal
     has_claims = measurements.gnss is not None and measurements.gnss.has_claims
     if has_claims and prior.vertical and prior.vertical.claimed_m2 < NO_TRUST:
-        vertical = by_heights.find_noise(prior.vertical, "up white", "up process", "up moving")
+        vertical = by_heights.find_noise(prior.vertical, "up white", "up process")
         prior = replace(prior, vertical=vertical, densities={UP: by_heights.get_densities()})
     plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, longest_s)
     if has_claims and horizontal:
-        horizontal = plane.find_noise(horizontal, "fix white", "fix process", "fix moving")
+        horizontal = plane.find_noise(horizontal, "fix white", "fix process")
     return replace(
         prior,
         horizontal=horizontal,
@@ -329,15 +327,11 @@ def _find_fix_prior(
     fixes = vertical if axis == "up" else horizontal
     if kind == "white":
         return fixes.white, fixes.claimed_m2
-    if kind == "moving":
-        return 0.0, _MOVING_STD * fixes.claimed_m2
     usual = fixes.correlated.variance * _share_process(fixes.correlated.time_s, float(time_s), FIX_S)
     if axis == "up" or not of_heights:
         return usual, _PROCESS_STD * fixes.claimed_m2
     ratio = horizontal.claimed_m2 / vertical.claimed_m2
-    shown = {
-        each: ratio * variance for each, variance in of_heights.items() if each.startswith(("up process", "up moving"))
-    }
+    shown = {each: ratio * variance for each, variance in of_heights.items() if each.startswith("up process")}
     alike = sum(variance for each, variance in shown.items() if each.endswith(f" {time_s}"))
     return alike, _AXES_STD * max(sum(shown.values()), horizontal.correlated.variance)
 

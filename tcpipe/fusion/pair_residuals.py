@@ -36,8 +36,6 @@ from tcpipe.fusion.signals import compute_seconds, find_longest_step_ns, interpo
 ALONG, ACROSS, UP = "along", "across", "up"
 FIX_S, SCALE_S = (1.0, 3.0, 10.0, 30.0, 100.0), (3.0, 10.0, 30.0, 100.0)
 """Correlation times of processes [s]: of fixes, of scales and directions."""
-MOVING_S = (1.0, 3.0)
-"""The same of errors of fixes that are there only while the robot moves."""
 
 _STILL_MPS = 0.02  # slower: stationary
 _PAIR_STEP_S = 0.1  # between windows' ends of sensors that are no fixes
@@ -146,9 +144,6 @@ def _compare_fixes(
         for axis, value in values.items():
             features = _describe_fixes(gnss, axis, first, last, time_s)
             features |= window.describe(role, axis, has_others=has_others)
-            features |= window.describe_moving("up" if axis == UP else "fix")
-            if axis != UP:
-                features["stamp"] = window.describe_stamps(axis)
             stamps = gnss.stamp_ns[first], gnss.stamp_ns[last]
             made.append(Residuals((GNSS, role), axis, time_s, *stamps, value, features, is_still))
     return made
@@ -245,18 +240,6 @@ class _Window:
         features |= {f"heading scale {tau:g}": _integrate_process(other, self.time_s, tau) for tau in SCALE_S}
         features["slide velocity"] = self._integrate_moving(self._aside if axis == ALONG else self._ahead)
         return features
-
-    def describe_moving(self, name: str) -> dict[str, Floats]:
-        """Return the factors of errors of fixes that exist only in motion: receivers hold a stationary position."""
-        begin, end = (np.abs(self._speed[:, [0, -1]]) > _STILL_MPS).T.astype(np.float64)
-        return {
-            f"{name} moving {tau:g}": begin + end - 2.0 * begin * end * np.exp(-self.time_s / tau) for tau in MOVING_S
-        }
-
-    def describe_stamps(self, axis: str) -> Floats:
-        """Return the factor of the variance of the stamps at both ends, of the nodes nearest to them."""
-        velocity = self._speed * (self._ahead if axis == ALONG else self._aside)
-        return np.asarray(np.square(velocity[:, 0]) + np.square(velocity[:, -1]))
 
     def describe_odometry(self, role: str, axis: str) -> dict[str, Floats]:
         """Return the factors of an odometry's own densities."""
