@@ -12,7 +12,7 @@ from tcpipe.simulation import make_tiny
 
 UNUSED = {
     "pandas", "filterpy", "pydantic", "zarr", "rasterio", "matplotlib", "polars", "pyproj", "shapely", "mcap", "torch", "lightgbm",
-    "ruamel.yaml", "scipy.linalg", "scipy.optimize", "scipy.signal", "scipy.spatial", "scipy.special", "scipy.stats",
+    "ruamel.yaml", "scipy.signal", "scipy.stats",
 }  # fmt: skip
 PROGRAM = """
 import sys

@@ -254,7 +254,7 @@ def test_a_drive_without_a_segment_is_news_once_and_can_be_accepted(tmp_path):
 
 def raise_version(monkeypatch):
     for module in (plan_module, ingest_module, ingest_run_module):
-        monkeypatch.setattr(module, "RESULTS_VERSION", 7)
+        monkeypatch.setattr(module, "RESULTS_VERSION", RESULTS_VERSION + 1)
 
 
 def test_a_version_with_other_results_makes_all_runs_again_and_says_how_many(night, monkeypatch, caplog):
@@ -264,14 +264,14 @@ def test_a_version_with_other_results_makes_all_runs_again_and_says_how_many(nig
     found = where(night)
     assert found.counts == {"outdated": 3, "failed_permanent": 1}
     assert {group.cause for group in found.groups if group.state == "outdated"} == {
-        f"made with version {RESULTS_VERSION} of the results, which now are version 7"
+        f"made with version {RESULTS_VERSION} of the results, which now are version {RESULTS_VERSION + 1}"
     }
     caplog.clear()
     summary = ingest([logs], store=store, recipe=Recipe())
     (line,) = [line for line in caplog.messages if "gives other results" in line]
-    assert f"tcpipe {__version__} gives other results (version 7): 3 runs are made again" in line
+    assert f"tcpipe {__version__} gives other results (version {RESULTS_VERSION + 1}): 3 runs are made again" in line
     assert sorted(result.status for result in summary.results) == ["damaged", "done", "done", "failed"]
-    assert {run.facts.results_version for run in Store(store).runs()} == {7}
+    assert {run.facts.results_version for run in Store(store).runs()} == {RESULTS_VERSION + 1}
     caplog.clear()
     ingest([logs], store=store, recipe=Recipe())
     assert caplog.messages == []

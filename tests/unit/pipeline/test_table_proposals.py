@@ -144,7 +144,7 @@ def test_tables_of_two_drives_are_not_mixed(tmp_path):
 
 def test_one_table_of_odd_names_is_fixes_wheels_and_power(tmp_path):
     table = {"Timestamp_us": WALL_NS // 1000, "GPS__Lat": 26.37 + 1e-6 * np.arange(ROWS), "GPS__Lng": -80.1}
-    table |= {"Alt__MSL__(ft)": 10.0, "Fix__Quality": 4, "spd_L__(km/h)": 1.8, "spd_R__(km/h)": 1.9, "SoC__%": 80}
+    table |= {"Alt__MSL__(ft)": 10.0, "Fix__Quality": 4, "spd_L__(km/h)": 3.9, "spd_R__(km/h)": 4.1, "SoC__%": 80}
     write(tmp_path / "log.csv", **table, **{"U_bat__[V]": 25.1, "I_bat__[A]": 2.0 + SECONDS})
     values, recipe, _ = proposed(tmp_path)
     tables = values["tables"]
@@ -157,8 +157,8 @@ def test_one_table_of_odd_names_is_fixes_wheels_and_power(tmp_path):
     log = open_single_log(tmp_path, message_definitions=None, tables=recipe.tables)
     read = log.tables(["/gnss", "/wheel_odometry"])
     assert read["/gnss"]["altitude"][0].as_py() == pytest.approx(3.048)
-    assert read["/wheel_odometry"]["twist.twist.linear.x"][0].as_py() == pytest.approx(1.85 / 3.6)
-    assert read["/wheel_odometry"]["twist.twist.angular.z"][0].as_py() == pytest.approx(0.1 / 3.6 / 0.5)
+    assert read["/wheel_odometry"]["twist.twist.linear.x"][0].as_py() == pytest.approx(4.0 / 3.6)
+    assert read["/wheel_odometry"]["twist.twist.angular.z"][0].as_py() == pytest.approx(0.2 / 3.6 / 0.5)
 
 
 def test_what_is_not_recognised_is_named_under_its_role_with_three_values(tmp_path):
