@@ -43,6 +43,7 @@ from tcpipe.fusion.measurements import (
     NO_LEVER_ARM,
     NO_TRUST,
     STATED_ARM_STD_M,
+    UNSTATED_ARM_STD_M,
     WHEELS,
     InitialState,
     Measurements,
@@ -55,6 +56,7 @@ from tcpipe.fusion.smoother_kernel import LARGEST_EVENT, SELDOM, Candidates, Smo
 from tcpipe.fusion.state import Error, Kind
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
+from tcpipe.robust import MIN_SIGMAS
 from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding, read_threshold
 
@@ -87,6 +89,11 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     start.x[:9] = levelled.states[0, :9]
     made = section.filter(start)
     smoothed, events = smooth_section(made)
+    if (corrected := section.correct_arm(made, smoothed)) is not section:
+        section = corrected
+        start = section.make_start(initial)._replace(x=start.x)
+        made = section.filter(start)
+        smoothed, events = smooth_section(made)
     if _can_tell_changes(section.measurements):
         explanation = section.explain(made, events, start)
     if explanation.changes:
@@ -185,6 +192,19 @@ class SectionModel:
             possible=POSSIBLE if judges else (),
         )
         return ticks, model, widen_start(start, std).select(model.active)
+
+    def correct_arm(self, made: Pass, smoothed: Smoothed) -> SectionModel:
+        """Return the section with an antenna of unknown place if it surely shows another than stated; else itself."""
+        gnss, active = self.measurements.gnss, list(made.model.active)
+        if gnss is None or Error.ARM not in active:
+            return self
+        off = np.abs(smoothed.states[-1, Error.ARM + 6 : Error.ARM + 9] - gnss.lever_arm_m)
+        place = active.index(Error.ARM)
+        known = smoothed.spreads[-1, place : place + 3]
+        if not (off > np.maximum(2.0 * np.asarray(gnss.lever_arm_std_m), MIN_SIGMAS * known)).any():
+            return self
+        m = replace(self.measurements, gnss=replace(gnss, lever_arm_std_m=UNSTATED_ARM_STD_M))
+        return replace(self, measurements=m, std=make_priors(m, self.noise, self.ticks)[0])
 
     def explain(self, made: Pass, events: Sequence[Change], start: Memory) -> Hypothesis:
         """Return the changes that explain most of where sensors contradict each other, none where they do not.

@@ -33,7 +33,7 @@ FIXES = (GNSS, POSE)
 NO_TRUST = 1e6
 """Largest variances, of a kilometre or a kilometre a second; larger ones would cost digits of differences."""
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
-STATED_ARM_STD_M = (0.05, 0.05, 0.15)
+STATED_ARM_STD_M = (0.05, 0.05, 0.1)
 """Of an antenna whose place is stated: a tape measure, and the height of base_link over the ground."""
 UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)
 """Of one whose place is not: it is on the robot."""

@@ -125,7 +125,7 @@ class FuseConfig(_Section):
     gnss_default_std_m: Deviation = 0.05
     """Horizontal σ where the receiver gives none (the paper's RTK: 5 cm); vertical is twice as large [m]."""
     lever_arm_std_m: tuple[Tolerance, Tolerance, Tolerance] | None = omit()
-    """Standard deviation of the lever arm of GNSS antenna or pose [m]; 0: exact. Default: 0.05 horizontal, up 0.15."""
+    """Standard deviation of the lever arm of GNSS antenna or pose [m]; 0: exact. Default: 0.05 horizontal, up 0.1."""
     gnss_velocity_std_mps: Deviation = omit(0.1)
     """σ of a receiver's own velocity if it gives none (NMEA never does) [m/s]; vertical is twice as large."""
     wheel_std_mps: Deviation = 0.05

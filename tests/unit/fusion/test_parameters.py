@@ -143,5 +143,5 @@ def test_a_straight_drive_without_slopes_shows_no_height_of_the_antenna():
     )
     measured, _ = measure_with(level, 1, drawn)
     arm = fuse(measured).facts.parameters["antenna"]
-    assert arm.std[2] == pytest.approx(arm.prior_std[2], rel=0.15)
-    assert abs(arm.value[2]) < 0.4 * arm.prior_std[2]
+    assert arm.std[2] == pytest.approx(arm.prior_std[2], rel=0.1)
+    assert abs(arm.value[2]) < 0.3 * arm.prior_std[2]
