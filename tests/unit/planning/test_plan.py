@@ -73,7 +73,7 @@ def test_no_other_plan_takes_less_of_what_a_plan_is_the_least_of():
     fit = PhysicsFit(500, (term,), {}, 0.4, 8.0, {}, None, 0.05)
     model = replace(MODEL, physics=fit, patch_px=8)
     survey = make_survey(model, source, 2.0)
-    survey.predict(np.ones_like(survey.predicted), lambda _, __: None)
+    survey.predict(np.ones_like(survey.predicted))
     for _ in range(4):
         ends = lonlat(source, (4.0, rng.uniform(4.0, 36.0)), (36.0, rng.uniform(4.0, 36.0)))
         plans = {objective: plan_path(survey, *ends, objective) for objective in OBJECTIVES}
@@ -92,7 +92,7 @@ def test_less_risk_is_taken_on_ground_that_the_model_knows_well():
     residuals["power_watt"] = 150.0 * (1.0 + error)
     model = replace(FlatModel(), patch_px=8, residuals=residuals)
     survey = make_survey(model, source, 1.0)
-    survey.predict(np.ones_like(survey.predicted), lambda _, __: None)
+    survey.predict(np.ones_like(survey.predicted))
     ends = lonlat(source, (4.0, 12.5), (26.0, 12.5))
     plain, careful = (plan_path(survey, *ends, "energy", risk=risk) for risk in (None, 0.95))
     assert careful.totals.energy_joule > plain.totals.energy_joule
@@ -120,7 +120,7 @@ def test_without_a_cost_map_the_cells_of_short_paths_are_predicted_and_the_plan_
     source = plane(72.0, pixel_size_m=0.2, classes=lambda _, north: np.where(np.abs(north - 36.0) < 2.0, 4, 7))
     model = replace(MODEL, patch_px=8)
     lazy, whole = make_survey(model, source, 1.0), make_survey(model, source, 1.0)
-    whole.predict(np.ones_like(whole.predicted), lambda _, __: None)
+    whole.predict(np.ones_like(whole.predicted))
     with caplog.at_level("INFO", "tcpipe"):
         found = _plan(source, (6.0, 22.0), (66.0, 22.0), "energy", model=model, survey=lazy)
     straight, metres = energy_joule(7, 0.0) * 60.0, 60.0 / 0.9996
