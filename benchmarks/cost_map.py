@@ -58,7 +58,7 @@ def main() -> None:
         source, model = prepared(directory, side_m, width)
         costs = make_cost_map(model, source, directory / "warm", cell_size_m=1.0).card.cells
         survey = make_survey(model, source, 1.0)
-        survey.predict(np.ones_like(survey.predicted), lambda _, __: None)
+        survey.predict(np.ones_like(survey.predicted))
         patches = int(np.count_nonzero(np.isfinite(survey.costs.velocity_mps)))
         together = model.card.layout.batch_rows
         ready = np.random.default_rng(0).random((together, 40, 40, 3)).astype(np.float32)

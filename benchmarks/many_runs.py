@@ -27,7 +27,7 @@ from tcpipe.formats.atomic import make_unique_name
 from tcpipe.formats.documents import BLOBS, INDEX, State, make_key
 from tcpipe.formats.integrity import compute_checksum
 from tcpipe.formats.logs.writing import write_mcap
-from tcpipe.formats.runs import LogOrigin, Run, find_lineage
+from tcpipe.formats.runs import LogOrigin, LogSnapshot, Run, find_lineage
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.calls import INGEST, record_call
 from tcpipe.pipeline.ingest import CallOptions, ingest
@@ -112,7 +112,7 @@ def _add_copy(store: Store, state: State, first: StoredRun, table: pa.Table, sou
         tables={**manifest.tables, "segments.parquet": checksum},
     )
     store.put_run(state, run)
-    store.put(state, "seen", make_key(find_lineage(source.origins)), source.sighting(sha256))
+    store.put(state, "seen", make_key(find_lineage(source.origins)), LogSnapshot(source.origins, source.files, sha256))
 
 
 def _link(file: Path, link: Path) -> None:
