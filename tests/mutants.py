@@ -61,14 +61,14 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             *name_files(
                 "tcpipe/fusion/{}.py",
-                "attitude dead_reckoning densities initial level_motion measurements pair_residuals preparation process signals ticks",
+                "attitude course densities initial level_motion measurements pair_residuals preparation process signals ticks",
             ),
             "tcpipe/fusion/checks",
         ),
         (
             *name_files(
                 "tests/unit/fusion/test_{}.py",
-                "signals attitude dead_reckoning preparation pose_increments initial ticks",
+                "signals attitude course preparation pose_increments initial ticks",
             ),
             "tests/unit/fusion/checks",
             "tests/unit/fusion/test_densities.py",

@@ -1,6 +1,6 @@
 """Explain contradictions between sensors by changes: steps of fixes or clocks, moved antennas, scales, biases.
 
-A change makes one block of the state uncertain at a tick, and again where it ends. `passes.smooth_section` finds when,
+A change makes one block of the state uncertain at a tick, and again where it ends. `error_state.smooth_section` finds when,
 by the log evidence of such an impulse at every tick. A step of fixes makes them uncertain on both sides, since nothing
 shows which side is right. Errors may also be larger than usual throughout. Sets of changes are compared by the
 likelihood of all measurements, in which a measurement beyond the gate counts as the gate, less a cost by kind.

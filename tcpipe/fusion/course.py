@@ -10,9 +10,7 @@ from tcpipe.fusion.signals import compute_interval_means, compute_seconds, remov
 
 MIN_SPEED_MPS = 0.2
 """Speed below which motion shows no course [m/s] (ruling)."""
-
-
-_GRID_S = 0.5  # of the course
+_GRID_S = 0.5
 """Time between two courses [s]."""
 
 

@@ -7,7 +7,7 @@ evidence against a sensor.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,8 +69,6 @@ class NoiseModel:
     odometries: Mapping[str, SensorNoise]
     turns: Mapping[str, SensorNoise]
     shared_scale: GaussMarkov
-    densities: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
-    """By axis, the fitted densities by the names of `tcpipe.fusion.pair_residuals.Residuals.features`."""
 
 
 PRIORS = {
@@ -105,6 +103,7 @@ PRIORS = {
 }
 """Variances before the fit, and densities of white noise, which have no correlation time; units in the comments."""
 
+_NO_PROCESS = GaussMarkov(0.0, 10.0)  # [s]: without variance any correlation time does
 _FLOOR_M, _FLOOR_SHARE = 0.002, 0.0025
 """Least white noise of fixes, absolute and of the claimed variance: filters repeat their errors to 0.1 mm."""
 _CENTIMETRES_M2 = 0.1**2  # fixes that claim less are RTK's
@@ -153,13 +152,13 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
         return prior
     section_ns = max(each.end_ns.max() for each in residuals) - min(each.start_ns.min() for each in residuals)
     longest_s = 1e-9 * float(section_ns) / _LEAST_WINDOWS
-    by_heights = _Fit([each for each in residuals if each.axis == UP], prior, longest_s)
+    by_heights, of_heights = _Fit([each for each in residuals if each.axis == UP], prior, {}, longest_s), {}
     horizontal = prior.horizontal
     has_claims = measurements.gnss is not None and measurements.gnss.has_claims
     if has_claims and prior.vertical and prior.vertical.claimed_m2 < NO_TRUST:
         vertical = by_heights.find_noise(prior.vertical, "up white", "up process")
-        prior = replace(prior, vertical=vertical, densities={UP: by_heights.get_densities()})
-    plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, longest_s)
+        prior, of_heights = replace(prior, vertical=vertical), by_heights.get_densities()
+    plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, of_heights, longest_s)
     if has_claims and horizontal:
         horizontal = plane.find_noise(horizontal, "fix white", "fix process")
     return replace(
@@ -169,7 +168,6 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
             role: plane.find_noise(of, f"{role} velocity", f"{role} scale") for role, of in prior.odometries.items()
         },
         shared_scale=plane.find_process(prior.shared_scale, "shared scale"),
-        densities={axis: fit.get_densities() for axis, fit in ((ALONG, plane), (ACROSS, plane), (UP, by_heights))},
     )
 
 
@@ -198,11 +196,13 @@ class _Cell:
 class _Fit:
     """Non-negative densities by name, fitted to residuals: E r² = Σ density × feature, with the weights of that sum."""
 
-    def __init__(self, residuals: Sequence[Residuals], prior: NoiseModel, longest_s: float) -> None:
+    def __init__(
+        self, residuals: Sequence[Residuals], prior: NoiseModel, of_heights: Mapping[str, float], longest_s: float
+    ) -> None:
         self._names = sorted({name for each in residuals for name in each.features})
         self._longest_s = longest_s
         self._cells = [cell for each in residuals for cell in _split_cells(each, self._names)]
-        pairs = np.array([_find_prior(name, prior) for name in self._names]).reshape(-1, 2)
+        pairs = np.array([_find_prior(name, prior, of_heights) for name in self._names]).reshape(-1, 2)
         self._mean, self._std = pairs.T
         self._variances, self._covariance = self._mean, np.diag(self._std**2)
         cells = [
@@ -299,11 +299,11 @@ def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
         yield _Cell(each, is_still, features[rows], np.square(each.value[rows]), apart_s)
 
 
-def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
-    """Return mean and standard deviation of a density before the data speak."""
+def _find_prior(name: str, prior: NoiseModel, of_heights: Mapping[str, float]) -> tuple[float, float]:
+    """Return mean and standard deviation of a density before the fit; ``of_heights``: fitted densities of heights."""
     kind, _, last = name.rpartition(" ")
     if name.startswith(("fix ", "up ")) and prior.horizontal is not None and prior.vertical is not None:
-        return _find_fix_prior(name, prior.horizontal, prior.vertical, prior.densities.get(UP, {}))
+        return _find_fix_prior(name, prior.horizontal, prior.vertical, of_heights)
     known = PRIORS[kind if kind in PRIORS else name]
     variance = known.variance
     if last == "velocity" and kind in prior.odometries:
@@ -332,8 +332,7 @@ def _find_fix_prior(
         return usual, _PROCESS_STD * fixes.claimed_m2
     ratio = horizontal.claimed_m2 / vertical.claimed_m2
     shown = {each: ratio * variance for each, variance in of_heights.items() if each.startswith("up process")}
-    alike = sum(variance for each, variance in shown.items() if each.endswith(f" {time_s}"))
-    return alike, _AXES_STD * max(sum(shown.values()), horizontal.correlated.variance)
+    return shown[f"up process {time_s}"], _AXES_STD * max(sum(shown.values()), horizontal.correlated.variance)
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:
@@ -351,7 +350,7 @@ def _share_process(time_s: float, tau_s: float, taus_s: Sequence[float]) -> floa
 def _summarize(structure: Floats) -> GaussMarkov:
     """Return the process whose structure function is nearest to one at `_SUMMARY_S`, in the logarithm."""
     if not (structure > 0.0).all():
-        return GaussMarkov(0.0, 10.0)  # s; any time
+        return _NO_PROCESS
     shape = -2.0 * np.expm1(-_SUMMARY_S / _SUMMARY_TAU_S[:, None])
     ratio = np.log(structure / shape)
     best = int(np.argmin(ratio.std(1)))
@@ -386,7 +385,7 @@ def _make_fix_prior(gnss: Positions, axes: slice) -> SensorNoise:
     """Return the noise of fixes whose claims are right in total."""
     claimed = float(np.median(gnss.variance_m2[:, axes]))
     if claimed >= NO_TRUST:  # not measured: there is no error that lasts, which would be kilometres
-        return SensorNoise(claimed, GaussMarkov(0.0, 10.0), claimed)
+        return SensorNoise(claimed, _NO_PROCESS, claimed)
     prior = PRIORS["fix, centimetres" if claimed < _CENTIMETRES_M2 else "fix, more"]
     return SensorNoise((1.0 - prior.variance) * claimed, GaussMarkov(prior.variance * claimed, prior.time_s), claimed)
 

@@ -44,6 +44,9 @@ class GateVerdict(IntEnum):
     NONE, ACCEPTED, REJECTED, RESET = range(4)
 
 
+RESET_REJECTIONS, RESET_SPEED_STD_MPS = 5, 0.3
+"""Least rejections in a row before a reset [1], and σ of the velocity after it, as at the start [m/s]."""
+
 Indices = NDArray[np.int64]
 
 
@@ -497,12 +500,12 @@ def filter_ticks(
             if not nis <= model.gates[kind]:
                 verdict = GateVerdict.REJECTED
                 waits[kind, 0] += 1.0
-                if waits[kind, 0] >= 5.0 and waits[kind, 1] >= model.patience_s[kind]:
+                if waits[kind, 0] >= RESET_REJECTIONS and waits[kind, 1] >= model.patience_s[kind]:
                     verdict = GateVerdict.RESET
                     measured = Error.RHO if kind == Kind.FIX else Error.THETA
                     for i in range(3):
                         P[measured + i, measured + i] += y[i] * y[i]
-                        P[Error.U + i, Error.U + i] += 0.3**2  # m/s: as at the start
+                        P[Error.U + i, Error.U + i] += RESET_SPEED_STD_MPS**2
                     P[Error.THETA + 2, Error.THETA + 2] += 0.1**2  # rad
                     _compare(k, kind, inputs, model, x, P, acceleration, gain, room)
             tests.verdict[k, kind] = verdict

@@ -47,7 +47,7 @@ def find_initial_state(measurements: Measurements, stationary_ns: Ints, start_ns
     track = next(iter(motion.tracks.values()), None) if motion is not None else None
     yaw, yaw_std, heading_from = _estimate_yaw(m, motion, track, start_ns, bias_std)
     quat = quat_from_rpy(roll, pitch, yaw)
-    position, position_std = _estimate_position(m.gnss, track, quat, start_ns)
+    position, position_std = _estimate_position(m.gnss, motion, track, quat, start_ns)
     velocity, velocity_std = np.zeros(3), 2.0  # m/s: no sensor shows it
     if m.first_odometry is not None:
         along = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
@@ -122,7 +122,7 @@ def _estimate_yaw(
 
 
 def _estimate_position(
-    gnss: Positions | None, track: OdometryTrack | None, quat: Floats, start_ns: int
+    gnss: Positions | None, motion: LevelMotion | None, track: OdometryTrack | None, quat: Floats, start_ns: int
 ) -> tuple[Floats, Floats]:
     """Return base_link at the start and its σ: the median of the first fixes less the displacement since the start."""
     if gnss is None:
@@ -130,8 +130,8 @@ def _estimate_position(
     few = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 1_000_000_000, "right"), 3, 10)))
     at_s, driven_m = compute_seconds(gnss.stamp_ns[few], start_ns), 0.0
     antenna_m = rotate(quat, gnss.lever_arm_m)
-    if track is not None:
-        grid_s: Floats = STEP_S * np.arange(track.speed_mps.size, dtype=np.float64)
+    if motion is not None and track is not None:
+        grid_s = motion.attitude.time_s
         turned = np.exp(1j * np.interp(at_s, grid_s, track.heading_rad)) * complex(*gnss.lever_arm_m[:2])
         moved_m = interpolate_signal(grid_s, track.path_m, at_s)
         antenna_m = moved_m + np.column_stack((turned.real, turned.imag, np.full(at_s.size, antenna_m[2])))

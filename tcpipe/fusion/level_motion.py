@@ -273,9 +273,8 @@ class _Alignment:
         self._start_s, self._end_s = time_s[first], time_s[last]
         self._moved_m = gnss.position_enu_m[last] - gnss.position_enu_m[first]
         self._knots_s = np.linspace(0.0, end_s, max(2, round(end_s / KNOT_S) + 1))
-        middle = 0.5 * (self._start_s + self._end_s)
-        self._hats = np.maximum(0.0, 1.0 - np.abs(middle[:, None] - self._knots_s) / self._knots_s[1])
-        self._middle_s = middle
+        self._middle_s = 0.5 * (self._start_s + self._end_s)
+        self._hats = np.maximum(0.0, 1.0 - np.abs(self._middle_s[:, None] - self._knots_s) / self._knots_s[1])
         # The turn scale of an odometry is an error of heading that grows with the turn.
         self._turn = (attitude.yaw_rad - attitude.yaw_rad.mean()) * (attitude.role != IMU)
 
@@ -297,7 +296,7 @@ class _Alignment:
         """Return scale, heading by knots, turn scale, arm and time offset; None where the fixes show no motion."""
         fix = self._moved_m[:, 0] + 1j * self._moved_m[:, 1]
         fit, time_s = _Fit(np.zeros_like(forward)), self._attitude.time_s
-        turn = np.interp(0.5 * (self._start_s + self._end_s), time_s, self._turn)
+        turn = np.interp(self._middle_s, time_s, self._turn)
         for number in range(_ROUNDS):
             velocity, arm = self._horizontal(forward, fit)
             moved = self._difference(integrate_grid(velocity) + arm)

@@ -132,7 +132,7 @@ def _compute_rounding_variances(values: Floats) -> Floats:
 def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tuple[Positions, list[list[int]]]:
     """Return the fixes without exact repetitions of the one before, and those that occur while the robot drives.
 
-    The latter as first and last stamp [ns], and number of repetitions.
+    Each of the latter is its first and last stamp [ns] and the number of repetitions.
 
     They carry no information: a receiver hangs, or a slow one is published at a higher rate. Without odometry a robot
     may be stationary where fixes repeat for a second and two of their periods: they are kept. So are fixes that never

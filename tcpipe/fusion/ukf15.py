@@ -20,7 +20,13 @@ from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
 from tcpipe.fusion.changes import Hypothesis
 from tcpipe.fusion.error_state import make_tests, make_trajectory, prepare_section
-from tcpipe.fusion.filter_kernel import FilterModel, GateVerdict, Memory
+from tcpipe.fusion.filter_kernel import (
+    RESET_REJECTIONS,
+    RESET_SPEED_STD_MPS,
+    FilterModel,
+    GateVerdict,
+    Memory,
+)
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S, InitialState, Measurements, Trajectory
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed
 from tcpipe.fusion.state import Error, Kind
@@ -69,7 +75,7 @@ def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pas
             if not nis <= model.gates[kind]:
                 verdict, since = GateVerdict.REJECTED, rejected[kind]
                 since.append(k)
-                if len(since) >= 5 and (k - since[0]) * period_s >= model.patience_s[kind]:
+                if len(since) >= RESET_REJECTIONS and (k - since[0]) * period_s >= model.patience_s[kind]:
                     verdict = GateVerdict.RESET
                     ukf.inflate(kind, innovation)
                     ukf.update(k, kind, np.inf)
@@ -157,7 +163,7 @@ class _Filter:
         measured = Error.RHO if kind == Kind.FIX else Error.THETA
         added, angles = np.zeros(Error.GYRO_BIAS), range(Error.RHO)
         added[measured : measured + 3] = innovation @ innovation
-        added[Error.U :] = 0.3**2  # m/s: as at the start
+        added[Error.U :] = RESET_SPEED_STD_MPS**2
         added[Error.THETA + 2] += _MAX_ANGLE_STD_RAD**2
         self._ukf.P[range(added.size), range(added.size)] += added
         self._ukf.P[angles, angles] = np.minimum(self._ukf.P[angles, angles], _MAX_ANGLE_STD_RAD**2)

@@ -22,6 +22,7 @@ from tcpipe.cost.labels import (
 )
 from tcpipe.fusion.densities import PRIORS
 from tcpipe.fusion.measurements import IMU
+from tcpipe.fusion.preparation import GRAVITY_BAND_MPS2
 from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.distance_breakdown import find_interval_reason, sum_by_reason
@@ -41,8 +42,6 @@ _ROLLING_MPS = 0.05
 """Wheels slower than this are stationary: their slip is unknown."""
 _SLIPPING = 0.2
 """Share of the wheels' speed, a mean along the slope, by which that of the robot may differ."""
-_GRAVITY_BAND_MPS2 = (8.0, 12.0)
-"""Range of the median specific force [m/s²]; outside (other unit, gravity removed) the vibration is unknown."""
 
 
 def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: TrackInfo, cost: Labels) -> Arrays:
@@ -116,7 +115,7 @@ def _compute_vibration(imu: pa.Table | None, start_ns: Ints, end_ns: Ints) -> Ar
     if imu is not None:
         force = np.column_stack([to_floats(imu, f"linear_acceleration_{axis}_mps2") for axis in "xyz"])
         is_known = np.isfinite(force).all(axis=1)
-        low, high = _GRAVITY_BAND_MPS2
+        low, high = GRAVITY_BAND_MPS2  # outside (other unit, gravity removed) the vibration is unknown
         if is_known.any() and low <= float(np.median(np.linalg.norm(force[is_known], axis=1))) <= high:
             found = compute_vibration_mps2(to_integers(imu, "stamp_ns")[is_known], force[is_known], start_ns, end_ns)
     return dict(zip(("vibration_mps2", "vibration_std_mps2"), found, strict=True))

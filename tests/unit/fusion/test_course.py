@@ -1,4 +1,4 @@
-"""Paths by speeds and turns, and turns of the course over ground, on circles."""
+"""Turns of the course over ground, on circles."""
 
 import numpy as np
 import pytest
