@@ -44,8 +44,13 @@ import numpy as np
 
 from tcpipe.errors import TcpipeError
 from tcpipe.formats.recipe_toml import load_recipe
-from tcpipe.fusion.withheld import Comparison, score_comparisons
-from tcpipe.pipeline.audit import WithheldComparisons, compare_withheld, read_audited
+from tcpipe.pipeline.audit import (
+    Comparison,
+    WithheldComparisons,
+    compare_withheld,
+    read_audited,
+    score_comparisons,
+)
 
 HUSKY = 'wheel_odometry = ["odometry/filtered"]\n'
 HUSKY_VARIANTS = {"": "", ", no GNSS": "gnss = []\n", ", no GNSS, no IMU": "gnss = []\nimu = []\n"}

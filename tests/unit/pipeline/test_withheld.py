@@ -10,9 +10,8 @@ from unit.fusion import drive
 from unit.stages.test_fuse import filled, sensor, streams_of
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion.withheld import Comparison, place_windows, score_comparisons
 from tcpipe.pipeline import audit as withheld
-from tcpipe.pipeline.audit import compare_withheld, withhold
+from tcpipe.pipeline.audit import Comparison, compare_withheld, place_windows, score_comparisons, withhold
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.tables.columns import to_floats, to_integers
