@@ -21,13 +21,7 @@ from tcpipe.cli.options import (
     recipe_option,
     store_option,
 )
-from tcpipe.cli.output import (
-    find_recipe_with_source,
-    print_json,
-    print_line,
-    print_lines,
-    show_progress,
-)
+from tcpipe.cli.output import find_recipe_with_source, print_json, print_line, print_lines, show_progress
 from tcpipe.errors import UsageError
 from tcpipe.pipeline.options import AddMapOptions, BuildDatasetOptions
 

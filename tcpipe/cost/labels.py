@@ -74,7 +74,7 @@ class SensorError:
     def std_joule(self, energy_joule: Floats, *, of_net_energy: bool = False) -> Floats:
         """Return the standard deviation of energies [J], shape (M,); net energy has no offset by the idle power."""
         variance = (self.gain_fraction * energy_joule) ** 2 + np.square(self.sign_joule)
-        return np.asarray(np.sqrt(variance if of_net_energy else variance + np.square(self.offset_joule)))
+        return np.sqrt(variance if of_net_energy else variance + np.square(self.offset_joule))
 
 
 def compute_labels(

@@ -125,12 +125,12 @@ class Physics:
     def is_driven(self, metres: FitSamples) -> Mask:
         """Return where motors, not the slope, drive the robot, shape (M,)."""
         always = _always(self.terms)
-        return np.asarray(_build_design_matrix(metres, self.terms)[:, ~always] @ self.value[~always] > 0.0)
+        return _build_design_matrix(metres, self.terms)[:, ~always] @ self.value[~always] > 0.0
 
     def parts_watt(self, metres: FitSamples) -> Floats:
         """Return the part of each coefficient in the predicted power [W], shape (M, J)."""
         gain = np.where(_always(self.terms) | self.is_driven(metres)[:, None], 1.0, self.recovered)
-        return np.asarray(_build_design_matrix(metres, self.terms) * gain * self.value)
+        return _build_design_matrix(metres, self.terms) * gain * self.value
 
     def power_watt(self, metres: FitSamples) -> Floats:
         """Return the predicted power [W], shape (M,)."""

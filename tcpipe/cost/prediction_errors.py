@@ -149,7 +149,7 @@ class QuantityErrors:
         none is.
         """
         own = self.stated_share * (self.usual_stated if stated is None else stated)
-        std = np.asarray((self.floor + self.share * np.abs(predicted) + own) * self.of_class[class_id])
+        std = (self.floor + self.share * np.abs(predicted) + own) * self.of_class[class_id]
         if self.near is None or is_near is None:
             return std
         return np.where(is_near, self.near.compute_std(predicted, class_id, stated), std)
@@ -213,7 +213,7 @@ class BiasCorrection:
     def apply(self, power_watt: Floats, velocity_mps: Floats, class_id: NDArray[np.integer]) -> tuple[Floats, Floats]:
         """Return centred power [W] and velocity [m/s], shape (N,) each."""
         slower, more = 1.0 + self.duration.value[class_id], 1.0 + self.energy.value[class_id]
-        return np.asarray(power_watt * more / slower), np.asarray(velocity_mps / slower)
+        return power_watt * more / slower, velocity_mps / slower
 
 
 _NO_BIAS = Bias(np.zeros(_CLASSES), np.zeros(_CLASSES))

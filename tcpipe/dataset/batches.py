@@ -64,7 +64,7 @@ class StoredPixels:
 
     def find_pieces(self, at: Ints) -> Ints:
         """Return the piece that holds each of the samples ``at``, (M,)."""
-        return np.asarray(np.searchsorted(self.files.starts, self.rows[at], side="right") - 1)
+        return np.searchsorted(self.files.starts, self.rows[at], side="right") - 1
 
     def pools(
         self, at: Ints, layers: Sequence[str], *, pieces: int, spare: int, rng: np.random.Generator | None

@@ -45,7 +45,7 @@ def mean_between(stamp_ns: Ints, value: Floats, start_ns: Ints, end_ns: Ints) ->
         integrate_to(stamp_ns, x, end_ns) - integrate_to(stamp_ns, x, start_ns)
         for x in (np.where(known, value, 0.0), 1.0 - known)
     )
-    return np.asarray(np.where(unknown > _NS, np.nan, total / ((end_ns - start_ns) * _NS)))
+    return np.where(unknown > _NS, np.nan, total / ((end_ns - start_ns) * _NS))
 
 
 def integrate_product_to(stamp_ns: Ints, a: Floats, b: Floats, at_ns: Ints) -> Floats:
@@ -66,7 +66,7 @@ def integrate_product_to(stamp_ns: Ints, a: Floats, b: Floats, at_ns: Ints) -> F
     share = part_s / step_s[row]
     a_end = a[row] + share * (a[row + 1] - a[row])
     b_end = b[row] + share * (b[row + 1] - b[row])
-    return np.asarray(whole[row] + _integrate_product(part_s, a[row], a_end, b[row], b_end))
+    return whole[row] + _integrate_product(part_s, a[row], a_end, b[row], b_end)
 
 
 def integrate_held_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
@@ -78,8 +78,8 @@ def integrate_held_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
     step_s = np.diff(stamp_ns) * _NS
     whole = np.concatenate(([0.0], np.cumsum(step_s * value[1:])))
     row = find_row_before(stamp_ns, at_ns)
-    return np.asarray(whole[row] + (at_ns - stamp_ns[row]) * _NS * value[row + 1])
+    return whole[row] + (at_ns - stamp_ns[row]) * _NS * value[row + 1]
 
 
 def _integrate_product(step_s: NDArray[np.floating], a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
-    return np.asarray(step_s * (2.0 * a0 * b0 + 2.0 * a1 * b1 + a0 * b1 + a1 * b0) / 6.0)
+    return step_s * (2.0 * a0 * b0 + 2.0 * a1 * b1 + a0 * b1 + a1 * b0) / 6.0

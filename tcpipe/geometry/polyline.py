@@ -57,7 +57,7 @@ class Polyline:
         v0, v1 = self.velocity_mps[row] * step_s, self.velocity_mps[row + 1] * step_s
         blend = u * u * (3.0 - 2.0 * u)
         swing = u * (1.0 - u) * ((1.0 - u) * v0 - u * v1)
-        return np.asarray(self.position_m[row] * (1.0 - blend) + self.position_m[row + 1] * blend + swing)
+        return self.position_m[row] * (1.0 - blend) + self.position_m[row + 1] * blend + swing
 
     def length_at(self, at_ns: Ints) -> Floats:
         """Return the horizontal length from the first sample to each time: [m], shape (M,).
@@ -65,9 +65,8 @@ class Polyline:
         Differences telescope, so the pieces of a path add up to the whole.
         """
         row, u, step_s = _locate(self.stamp_ns, at_ns)
-        return np.asarray(
-            self.length_m[row]
-            + _compute_partial_length_m(self.position_m[:, :2], self.velocity_mps[:, :2], row, u, step_s)
+        return self.length_m[row] + _compute_partial_length_m(
+            self.position_m[:, :2], self.velocity_mps[:, :2], row, u, step_s
         )
 
     def first_crossing_ns(self, start_ns: int, *, radius_m: float) -> int | None:
@@ -114,7 +113,7 @@ def _compute_partial_length_m(
     step_m = (xy_m[row + 1] - xy_m[row])[:, None, :]
     v0, v1 = (velocity_mps[row] * step_s)[:, None, :], (velocity_mps[row + 1] * step_s)[:, None, :]
     tangent = 6.0 * u * (1.0 - u) * step_m + (1.0 - u) * (1.0 - 3.0 * u) * v0 + u * (3.0 * u - 2.0) * v1
-    return np.asarray(until[:, 0] * (np.hypot(tangent[..., 0], tangent[..., 1]) @ (0.5 * _GAUSS_WEIGHTS)))
+    return until[:, 0] * (np.hypot(tangent[..., 0], tangent[..., 1]) @ (0.5 * _GAUSS_WEIGHTS))
 
 
 @compile_kernel

@@ -290,11 +290,7 @@ def _compute_features(patches: Patches, inputs: Inputs) -> Floats:
 
 
 def fit_table(
-    features: Floats,
-    labels: Floats,
-    folds: NDArray[np.generic],
-    inputs: Inputs,
-    config: TrainConfig | None = None,
+    features: Floats, labels: Floats, folds: NDArray[np.generic], inputs: Inputs, config: TrainConfig | None = None
 ) -> tuple[BoostingModel, Floats, int]:
     """Fit curves, and trees to the residuals of curves of the other folds.
 

@@ -300,14 +300,14 @@ def parse_stamps_ns(values: Array, unit: str) -> Ints | str:
     if np.issubdtype(values.dtype, np.integer):
         return np.asarray(values, np.int64) * factor
     whole: Floats = np.floor(values)
-    return np.asarray(whole.astype(np.int64) * factor + np.round((values - whole) * factor).astype(np.int64))
+    return whole.astype(np.int64) * factor + np.round((values - whole) * factor).astype(np.int64)
 
 
 def utc_from_gps_ns(stamp_ns: Ints) -> Ints:
     """Return GPS time written as a date [ns since 1970] as UTC [ns]; from July 2012 on."""
     since = np.array([(start + leap) * 1_000_000_000 for start, leap in _LEAPS])
     leap_s = np.array([leap for _, leap in _LEAPS], np.int64)[np.searchsorted(since, stamp_ns, side="right") - 1]
-    return np.asarray(stamp_ns - leap_s * 1_000_000_000)
+    return stamp_ns - leap_s * 1_000_000_000
 
 
 def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, Array] | list[str]:

@@ -181,4 +181,4 @@ def add_date(time_of_day_ns: Ints, log_time_ns: Ints) -> Ints:
 
 
 def _wrap_to_zero(offset_ns: Ints) -> Ints:
-    return np.asarray((offset_ns + NS_PER_DAY // 2) % NS_PER_DAY - NS_PER_DAY // 2)
+    return (offset_ns + NS_PER_DAY // 2) % NS_PER_DAY - NS_PER_DAY // 2

@@ -305,7 +305,7 @@ class _Cursors:
     def find_finished(self) -> Mask:
         """Return which messages fit, and have no more bytes left than may follow the last field."""
         left = self._sizes - (self._at if isinstance(self._bases, Grid) else self._positions)
-        return np.asarray(self._good & (left >= 0) & (left <= self._dialect.padding))
+        return self._good & (left >= 0) & (left <= self._dialect.padding)
 
     def values(self, wire_type: WireType, rows: Ints) -> Values:
         """Step over one value in each of the ``rows``: all messages, none, or some of those without a grid."""

@@ -62,7 +62,7 @@ def make_mask(spans: Ints, size: int) -> Mask:
     edges = np.zeros(size + 1, dtype=np.int64)
     np.add.at(edges, spans[:, 0], 1)
     np.add.at(edges, spans[:, 1] + 1, -1)
-    return np.asarray(np.cumsum(edges)[:size] > 0)
+    return np.cumsum(edges)[:size] > 0
 
 
 def find_piece_spans(piece: Ints) -> Ints:

@@ -89,7 +89,7 @@ def _filter_band(values: Floats, period_s: float) -> Floats:
     power = 2 * _ORDER
     gain = 1.0 / ((1.0 + (frequency_hz / HIGH_HZ) ** power) * (1.0 + (LOW_HZ / frequency_hz) ** power))
     spectrum[0], spectrum[1:] = 0.0, spectrum[1:] * gain
-    return np.asarray(np.fft.irfft(spectrum, len(values)))
+    return np.fft.irfft(spectrum, len(values))
 
 
 def _is_without_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_s: float) -> Mask:

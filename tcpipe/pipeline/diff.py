@@ -212,7 +212,7 @@ def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> Ints:
         found[files.starts[piece] : files.starts[piece + 1]] = [
             hash(b"".join(part.tobytes() for part in parts)) for parts in zip(*flat, strict=True)
         ]
-    return np.asarray(found[find_places_in_files(card, table.column("split").to_numpy())])
+    return found[find_places_in_files(card, table.column("split").to_numpy())]
 
 
 _WORDS = {

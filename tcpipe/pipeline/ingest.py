@@ -22,13 +22,7 @@ from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
 from tcpipe.formats.runs import LogFailure, LogSnapshot, find_lineage, find_problems, make_failure
 from tcpipe.pipeline.calls import INGEST, RunningCall, record_call
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
-from tcpipe.pipeline.log_sources import (
-    LogSource,
-    find_failure,
-    list_log_sources,
-    make_definitions_key,
-    select_shard,
-)
+from tcpipe.pipeline.log_sources import LogSource, find_failure, list_log_sources, make_definitions_key, select_shard
 from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import (
     IngestResult,

@@ -30,10 +30,7 @@ from tcpipe.tables.findings import Finding
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7
-_IN_WORDS: Mapping[LogState, str] = {
-    "failed_permanent": "failed permanently",
-    "failed_transient": "failed temporarily",
-}
+_IN_WORDS: Mapping[LogState, str] = {"failed_permanent": "failed permanently", "failed_transient": "failed temporarily"}
 
 
 @dataclass(frozen=True, slots=True)

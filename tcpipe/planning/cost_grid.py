@@ -126,7 +126,7 @@ class CostGrid:
         if objective == "distance":
             return np.ones_like(self.velocity_mps)
         slowness = 1.0 / self.velocity_mps
-        return np.asarray(self.power_watt * slowness if objective == "energy" else slowness)
+        return self.power_watt * slowness if objective == "energy" else slowness
 
     def open_courses(self, *, allow_extrapolation: bool) -> Mask:
         """Return the courses without obstacle and inside the training range, shape (16, rows, cols)."""

@@ -162,12 +162,7 @@ def make_cost_map_key(model: Model, source: MapFile, cell_size_m: float) -> str:
 
 
 def make_cost_map(
-    model: Model,
-    source: MapFile,
-    out: Location,
-    *,
-    cell_size_m: float,
-    origin_deg: tuple[float, float] | None = None,
+    model: Model, source: MapFile, out: Location, *, cell_size_m: float, origin_deg: tuple[float, float] | None = None
 ) -> CostMapResult:
     """Write the cost map of a whole map to ``out``, complete or not at all; an interrupted call resumes.
 

@@ -212,7 +212,7 @@ class Turning:
         drives exactly straight.
         """
         beyond_rad = np.abs(turn_rad) - self.usual_radpm * length_m
-        return np.asarray(self.joule_per_rad[class_id] * (beyond_rad if is_driven else np.maximum(beyond_rad, 0.0)))
+        return self.joule_per_rad[class_id] * (beyond_rad if is_driven else np.maximum(beyond_rad, 0.0))
 
 
 def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:

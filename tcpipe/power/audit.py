@@ -113,7 +113,7 @@ def _compute_moving_mean(values: Floats, rows: int) -> Floats:
     """Return the mean over so many rows around each, the ends repeated."""
     padded = np.pad(values, (rows // 2 + 1, rows - rows // 2 - 1), mode="edge")
     total = np.cumsum(padded)
-    return np.asarray((total[rows:] - total[:-rows]) / rows)
+    return (total[rows:] - total[:-rows]) / rows
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,7 +93,7 @@ def estimate_resolution(signal: SampledSignal) -> float:
 
 def _is_inside(at_ns: Ints, start_ns: Ints, end_ns: Ints) -> Mask:
     """Return whether each time, shape (N,), is inside one of several spans, (M,)."""
-    return np.asarray(np.searchsorted(start_ns, at_ns, side="right") > np.searchsorted(end_ns, at_ns, side="left"))
+    return np.searchsorted(start_ns, at_ns, side="right") > np.searchsorted(end_ns, at_ns, side="left")
 
 
 def _estimate_integral_variance(
@@ -238,7 +238,7 @@ def compute_curvature(signal: SampledSignal) -> Floats:
     t, x = signal.stamp_ns, signal.value
     right = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
     off_line = x[1:-1] - (1.0 - right) * x[:-2] - right * x[2:]
-    return np.asarray(off_line**2 / (1.0 + right**2 + (1.0 - right) ** 2))
+    return off_line**2 / (1.0 + right**2 + (1.0 - right) ** 2)
 
 
 def _estimate_error_variance(signal: SampledSignal, still: Mask, period_s: float, *, averaged: bool) -> float | None:
@@ -277,4 +277,4 @@ def _predict_second_differences(spacing: Floats, *, averaged: bool) -> Floats:
     if averaged:  # covariances of means over a period
         gain = (2.0 * np.sinh(rate / 2.0) / rate) ** 2
         apart, twice, own = gain * apart, gain * twice, 2.0 * (rate + np.expm1(-rate)) / rate**2
-    return np.asarray((6.0 * own - 8.0 * apart + 2.0 * twice) / 6.0)
+    return (6.0 * own - 8.0 * apart + 2.0 * twice) / 6.0

@@ -150,7 +150,7 @@ def _is_near_samples(stamp_ns: Ints, at_ns: Ints, max_gap_ns: int) -> Mask:
     before, last = np.searchsorted(stamp_ns, at_ns, "right") - 1, stamp_ns.size - 1
     after = np.searchsorted(stamp_ns, at_ns, "left")
     width = stamp_ns[np.minimum(after, last)] - stamp_ns[np.maximum(before, 0)]
-    return np.asarray((before >= 0) & (after <= last) & (width <= longest))
+    return (before >= 0) & (after <= last) & (width <= longest)
 
 
 Rule = Literal["exact", "averaged", "right_endpoint"]

@@ -527,7 +527,7 @@ def _weight_s(time_s: Floats) -> Floats:
     if time_s.size < 2:
         return np.ones_like(time_s)
     between = np.gradient(time_s)
-    return np.asarray(np.clip(between, 0.0, 3.0 * float(np.median(between))))
+    return np.clip(between, 0.0, 3.0 * float(np.median(between)))
 
 
 def _sum_currents(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Floats, Floats]:

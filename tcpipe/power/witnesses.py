@@ -105,7 +105,7 @@ def _average_neighbours(values: Floats, piece: Ints) -> Floats:
     neighbours[0, shift:][same] = values[:-shift][same]
     neighbours[1, :-shift][same] = values[shift:][same]
     count = np.isfinite(neighbours).sum(axis=0)
-    return np.asarray(np.where(count > 0, np.nansum(neighbours, axis=0) / np.maximum(count, 1), np.nan))
+    return np.where(count > 0, np.nansum(neighbours, axis=0) / np.maximum(count, 1), np.nan)
 
 
 def _fit_with_instruments(columns: Floats, instruments: Floats, target: Floats, *, column: int) -> tuple[float, float]:

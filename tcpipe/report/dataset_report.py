@@ -32,15 +32,7 @@ from tcpipe.report.label_sections import (
     make_repeatability_section,
 )
 from tcpipe.report.maps import draw_dataset_map
-from tcpipe.report.page import (
-    Column,
-    Link,
-    PageSection,
-    make_shown_column,
-    pack_columns,
-    render_page,
-    show_verdict,
-)
+from tcpipe.report.page import Column, Link, PageSection, make_shown_column, pack_columns, render_page, show_verdict
 from tcpipe.report.pictures import make_patches_data
 from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
@@ -140,13 +132,7 @@ def _make_map_section(shown: int, count: int, plots: list[Plot]) -> PageSection:
 
 
 def _make_data(
-    card: DatasetCard,
-    samples: pa.Table,
-    shown: Json,
-    *,
-    patches: Json,
-    map_plot: Plot,
-    hrefs: Mapping[str, str],
+    card: DatasetCard, samples: pa.Table, shown: Json, *, patches: Json, map_plot: Plot, hrefs: Mapping[str, str]
 ) -> dict[str, Json]:
     colours = choose_class_colours(card.classes)
     names = [renderer.name or "" for renderer in map_plot.figure.renderers]

@@ -29,15 +29,7 @@ from tcpipe.report.label_sections import (
     make_quality_section,
 )
 from tcpipe.report.maps import RunMap, StoredMaps, draw_run_map
-from tcpipe.report.page import (
-    Column,
-    Link,
-    PageSection,
-    make_shown_column,
-    pack_columns,
-    render_page,
-    show_verdict,
-)
+from tcpipe.report.page import Column, Link, PageSection, make_shown_column, pack_columns, render_page, show_verdict
 from tcpipe.report.run_plots import (
     REASON_WORDS,
     SPEED_ROLES,
@@ -122,12 +114,7 @@ def _draw_run(
     lines, spans = make_trace_lines(series), find_mask_spans(track, timeline, info.rate_hz)
     findings = find_finding_spans(info.report.findings, track, timeline)
     over_time, lines_json = time_plots(
-        timeline,
-        lines=lines,
-        spans=spans,
-        rejections=rejections,
-        has_labels=bool(segments.num_rows),
-        findings=findings,
+        timeline, lines=lines, spans=spans, rejections=rejections, has_labels=bool(segments.num_rows), findings=findings
     )
     data: dict[str, Json] = {
         "run": run.run_id,

@@ -90,7 +90,7 @@ class Mounting:
 
     def quat_xyzw(self) -> Floats:
         """Return base_link_from_sensor as a quaternion."""
-        return np.asarray(quat_from_rpy(*self.rpy_rad))
+        return quat_from_rpy(*self.rpy_rad)
 
 
 @dataclass(frozen=True, slots=True)

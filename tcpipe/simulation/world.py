@@ -181,18 +181,18 @@ class Surface:
         """Return what the brightness is multiplied with, at offsets from the site's corner [m]."""
         grain = 1.0 + self.swing * state(self.cover, u, v)
         grain *= self._by_class("grain")[classes] * evaluate_field(self.grain, u, v)
-        return np.asarray((1.0 - self._by_class("wet_shade")[classes] * state(self.wetness, u, v)) * (1.0 + grain))
+        return (1.0 - self._by_class("wet_shade")[classes] * state(self.wetness, u, v)) * (1.0 + grain)
 
     def resistance(self, classes: Bytes, u: Floats, v: Floats) -> Floats:
         """Return the rolling resistance that is added, as a fraction of the class's."""
         wet = self._by_class("wet_resistance")[classes] * state(self.wetness, u, v)
-        return np.asarray(wet + self._by_class("cover_resistance")[classes] * state(self.cover, u, v))
+        return wet + self._by_class("cover_resistance")[classes] * state(self.cover, u, v)
 
     def relief_m(self, classes: Bytes, u: Floats, v: Floats) -> Floats:
         """Return the height of bumps and ridges [m]."""
         relief = self._by_class("bump_m")[classes] * evaluate_field(self.bumps, u, v)
         relief += self._by_class("ridge_m")[classes] * evaluate_field(self.ridges, u, v)
-        return np.asarray(relief * (1.0 + self.swing * state(self.roughness, u, v)))
+        return relief * (1.0 + self.swing * state(self.roughness, u, v))
 
     def _by_class(self, name: str) -> Floats:
         """Return a property of the appearance of every class, by class id, shape (256,)."""
@@ -225,7 +225,7 @@ class Hill:
     def rise_m(self, u: Floats, v: Floats) -> Floats:
         """Return its height there [m]."""
         x, y = (u - self.x_m) / self.x_sigma_m, (v - self.y_m) / self.y_sigma_m
-        return np.asarray(self.height_m * np.exp(-0.5 * x**2) * np.exp(-0.5 * y**2))
+        return self.height_m * np.exp(-0.5 * x**2) * np.exp(-0.5 * y**2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.arrays import Floats
-from tcpipe.cost.labels import (
-    Labels,
-    SensorError,
-    combine_flags,
-    compute_labels,
-    subtract_idle_power,
-)
+from tcpipe.cost.labels import Labels, SensorError, combine_flags, compute_labels, subtract_idle_power
 from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_physics
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between

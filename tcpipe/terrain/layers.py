@@ -236,7 +236,7 @@ class Layer:
 
     def has_data(self, pixels: Pixels) -> Mask:
         """Return which pixels of the map have data."""
-        return np.isfinite(pixels) if self.mapped.kind == "f" else np.asarray(pixels != 0)
+        return np.isfinite(pixels) if self.mapped.kind == "f" else pixels != 0
 
     @property
     def channel_of_bytes(self) -> Floats32:

@@ -239,7 +239,7 @@ def _flatten(excess_m: Floats, xy_m: Floats) -> tuple[Floats, Floats, Ints]:
 def _remove_tilt(values: Floats, tilt: Floats) -> Floats:
     """Return values, shape (N, ...), less their least-squares fit by a tilt's columns, (N, 2), of mean zero."""
     flat = values.reshape(len(values), -1)
-    return np.asarray((flat - tilt @ (np.linalg.pinv(tilt) @ flat)).reshape(values.shape))
+    return (flat - tilt @ (np.linalg.pinv(tilt) @ flat)).reshape(values.shape)
 
 
 def _fit_height_scale(ground_m: Floats, height_m: Floats, xy_m: Floats) -> HeightScale:

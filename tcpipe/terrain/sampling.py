@@ -206,7 +206,7 @@ def make_patch_frames(start_xy_m: Floats, end_xy_m: Floats, chord_m: Floats) -> 
 def compute_footprints(frames: PatchFrames, patch_m: float) -> Floats:
     """Return each patch's corners in the map's CRS [m], counter-clockwise from rear right, shape (N, 4, 2)."""
     signs = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]) * (patch_m / 2.0)
-    return np.asarray(
+    return (
         frames.centre_xy_m[:, None, :]
         + signs[None, :, :1] * frames.along_xy[:, None, :]
         + signs[None, :, 1:] * frames.left_xy[:, None, :]

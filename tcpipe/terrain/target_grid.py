@@ -243,4 +243,4 @@ class MapGrid:
         """Return whether map points, shape (..., 2) [m], are finite and on the grid, outer edges included."""
         x_min, y_min, x_max, y_max = self.bounds_m
         x, y = xy_m[..., 0], xy_m[..., 1]
-        return np.asarray((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max))
+        return (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)

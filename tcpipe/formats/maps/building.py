@@ -47,12 +47,7 @@ from tcpipe.terrain.layers import (
     make_paper_layers,
 )
 from tcpipe.terrain.projection import parse_crs
-from tcpipe.terrain.target_grid import (
-    MapGrid,
-    choose_crs,
-    choose_grid,
-    find_projection,
-)
+from tcpipe.terrain.target_grid import MapGrid, choose_crs, choose_grid, find_projection
 
 logger = logging.getLogger("tcpipe")
 
@@ -264,12 +259,7 @@ def _find_assumed(terrain: LayerSource | None) -> tuple[Finding, ...]:
     return (make_finding("classes-assumed", Subject("layer", "terrain"), names=names),)
 
 
-def _make_facts(
-    grid: MapGrid,
-    layers: Mapping[str, LayerSource],
-    classes_from: str,
-    inputs: MapInputs,
-) -> MapFacts:
+def _make_facts(grid: MapGrid, layers: Mapping[str, LayerSource], classes_from: str, inputs: MapInputs) -> MapFacts:
     """Return what was found; layers that keep their own pixels may reach beyond the map."""
     covered = {}
     for role, layer in layers.items():

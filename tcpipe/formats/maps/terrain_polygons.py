@@ -182,7 +182,7 @@ def _project_polygons(
     placed = project_near(polygons, projection.forward, window_deg)
     on_map = shapely.intersects(placed, shapely.box(*bounds_m))
     if on_map.any():
-        return np.asarray(np.where(on_map, placed, shapely.Polygon()))
+        return np.where(on_map, placed, shapely.Polygon())
     lon, lat = shapely.get_coordinates(polygons).mean(axis=0)
     swapped = shapely.transform(polygons, lambda lonlat: lonlat[:, ::-1])
     if shapely.intersects(swapped, shapely.box(west, south, east, north)).any():

@@ -261,9 +261,7 @@ class _SegmentPositions:
     lonlat_deg: Floats
 
 
-def remove_duplicates(
-    runs: Sequence[StoredRun],
-) -> tuple[tuple[StoredRun, ...], dict[str, Mask], tuple[Finding, ...]]:
+def remove_duplicates(runs: Sequence[StoredRun]) -> tuple[tuple[StoredRun, ...], dict[str, Mask], tuple[Finding, ...]]:
     """Return the runs, by id, without second logs of a drive; of two, the first by id stays.
 
     Also, by run, marks of the segments that an earlier run has, too; and findings. ``runs`` are all of one recipe.
