@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,3 +12,7 @@ Floats32: TypeAlias = NDArray[np.float32]
 Ints: TypeAlias = NDArray[np.int64]
 Mask: TypeAlias = NDArray[np.bool_]
 Bytes: TypeAlias = NDArray[np.uint8]
+AnyInts: TypeAlias = NDArray[np.integer]
+Texts: TypeAlias = NDArray[np.str_]
+GenericArray: TypeAlias = NDArray[np.generic]
+AnyArray: TypeAlias = NDArray[Any]

@@ -17,11 +17,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import stdtrit
 
-from tcpipe.arrays import Floats, Mask
+from tcpipe.arrays import AnyInts, Floats, Mask
 from tcpipe.cost.prediction_errors import COVERAGE, NORMAL_HALF_WIDTH, QuantityErrors, SumDistribution
 
 _CHANGES = {0.0: 0.7, 0.1: 0.15, 0.3: 0.15}
@@ -41,7 +40,7 @@ class Metres:
 
     predicted: Floats
     measured: Floats
-    class_id: NDArray[np.integer]
+    class_id: AnyInts
     distance_m: Floats
     """Distance of its start along the run."""
     length_m: Floats
@@ -62,7 +61,7 @@ class Metres:
         return replace(self, **{name: value[rows] for name, value in values.items() if value is not None})
 
     @property
-    def ground(self) -> tuple[Floats, NDArray[np.integer], Floats | None, Mask | None]:
+    def ground(self) -> tuple[Floats, AnyInts, Floats | None, Mask | None]:
         """Return the arguments of the methods of `QuantityErrors`."""
         return self.predicted, self.class_id, self.stated_std, self.is_near
 

@@ -6,10 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import betaincinv, stdtrit
 
-from tcpipe.arrays import Mask
+from tcpipe.arrays import GenericArray, Mask
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
@@ -38,7 +37,7 @@ _FEWEST_RUNS = 5
 """Runs without which a coverage has no interval: two or three do not show how runs differ."""
 
 
-def measure_coverage(is_inside: Mask, runs: NDArray[np.generic]) -> Coverage:
+def measure_coverage(is_inside: Mask, runs: GenericArray) -> Coverage:
     """Return the share of samples that are inside, and its binomial interval, clustered by run.
 
     Errors of one run are correlated, so that its samples count as fewer: as many as the variance between runs shows,

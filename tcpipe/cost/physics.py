@@ -23,10 +23,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, Texts
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.facts import PhysicsFit, PhysicsScore, PhysicsTerm
 
@@ -77,7 +76,7 @@ class FitSamples:
     velocity_mps: Floats
     rise: Floats
     mean_abs_yaw_rate_radps: Floats
-    terrain: NDArray[np.str_]
+    terrain: Texts
 
     def take(self, rows: Ints | Mask) -> FitSamples:
         """Return some of them."""

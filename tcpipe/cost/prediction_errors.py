@@ -37,12 +37,12 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression, nnls
 from scipy.special import ndtr, ndtri, stdtrit
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import AnyInts, Floats, GenericArray, Ints, Mask
 
 Classes = NDArray[np.integer]
 Stated = Floats | float | None
 Near = Mask | None
-Residuals = Mapping[str, NDArray[np.generic]]
+Residuals = Mapping[str, GenericArray]
 
 COVERAGE = 0.9
 """Share of drives that an interval is to cover."""
@@ -210,7 +210,7 @@ class BiasCorrection:
     duration: Bias
     energy: Bias
 
-    def apply(self, power_watt: Floats, velocity_mps: Floats, class_id: NDArray[np.integer]) -> tuple[Floats, Floats]:
+    def apply(self, power_watt: Floats, velocity_mps: Floats, class_id: AnyInts) -> tuple[Floats, Floats]:
         """Return centred power [W] and velocity [m/s], shape (N,) each."""
         slower, more = 1.0 + self.duration.value[class_id], 1.0 + self.energy.value[class_id]
         return power_watt * more / slower, velocity_mps / slower

@@ -10,18 +10,17 @@ than too small.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import AnyInts, Floats, Ints
 from tcpipe.tables.facts import Floor
 
 _FEWEST_FITTED = 12
 """Below so many samples a class is described by its mean, not by a parabola over slope."""
 
 
-def compute_slope_residuals(values: Floats, terrain_class: NDArray[np.integer], slope_rad: Floats) -> Floats:
+def compute_slope_residuals(values: Floats, terrain_class: AnyInts, slope_rad: Floats) -> Floats:
     """Return what a parabola over slope, one a class, leaves of a label, shape (N,)."""
     left = np.empty(len(values))
     for kind in np.unique(terrain_class):
@@ -46,9 +45,7 @@ _FEWEST_BLOCKS = 5
 _CONFIDENCE = 0.95
 
 
-def find_repeated_pairs(
-    xy_m: Floats, course_rad: Floats, terrain_class: NDArray[np.integer], *, chord_m: float
-) -> Ints:
+def find_repeated_pairs(xy_m: Floats, course_rad: Floats, terrain_class: AnyInts, *, chord_m: float) -> Ints:
     """Return pairs of samples of one place, class and direction, shape (P, 2); no sample is in two pairs.
 
     Samples of one pass never qualify: they begin a chord apart. Of several passes the two nearest are the pair.

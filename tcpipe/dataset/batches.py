@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats32, Ints, Mask
+from tcpipe.arrays import Floats32, GenericArray, Ints, Mask
 from tcpipe.dataset.tensor import TensorLayout
 from tcpipe.formats.dataset_files import PatchFiles
 
@@ -142,7 +142,7 @@ class Batches:
     """Shape (N, 2)."""
     weights: Floats32 | None
     """Shape (N, 2)."""
-    features: Sequence[tuple[str, NDArray[np.generic]]]
+    features: Sequence[tuple[str, GenericArray]]
     """Names and values of columns, shape (N,)."""
     size: int
     shuffle: bool
@@ -224,6 +224,6 @@ class Batches:
         return batch if self.weights is None else (*batch, self.weights[samples])
 
 
-def _compute_features(named: Sequence[tuple[str, NDArray[np.generic]]], samples: Ints, mirrored: Mask) -> Floats32:
+def _compute_features(named: Sequence[tuple[str, GenericArray]], samples: Ints, mirrored: Mask) -> Floats32:
     columns = [np.where(mirrored & (name in _FLIPPED), -1.0, 1.0) * column[samples] for name, column in named]
     return np.column_stack(columns).astype(np.float32)

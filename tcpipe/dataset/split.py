@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tcpipe.arrays import Floats, Floats32, Ints
+from tcpipe.arrays import AnyArray, Floats, Floats32, GenericArray, Ints
 from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
 from tcpipe.dataset.energies import ENERGIES, Energy, find_energy, name_common_std
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
@@ -56,9 +56,9 @@ class SampleColumns:
 
     directory: Path
     rows: Ints
-    _read: dict[str, NDArray[np.generic]] = field(default_factory=dict)
+    _read: dict[str, GenericArray] = field(default_factory=dict)
 
-    def __getitem__(self, name: str) -> NDArray[np.generic]:
+    def __getitem__(self, name: str) -> GenericArray:
         """Return one column, nulls as NaN or None, shape (N,)."""
         if name not in self._read:
             there = sample_columns(self.directory)
@@ -162,7 +162,7 @@ class Split:
         """The tensor of all samples, float32 in [0, 1], shape (N, px, px, channels); formed once, then kept."""
         return self._form_tensor(np.arange(len(self)))
 
-    def column(self, name: str) -> NDArray[np.generic]:
+    def column(self, name: str) -> GenericArray:
         """Return a column of samples.parquet, shape (N,)."""
         return self._columns[name][self.view.at]
 
@@ -172,7 +172,7 @@ class Split:
         shared = np.nan_to_num(self.column(name_common_std(name)).astype(np.float64))
         return np.sqrt(np.maximum(total**2 - shared**2, 0.0))
 
-    def layers(self, indices: Ints) -> dict[str, NDArray[Any]]:
+    def layers(self, indices: Ints) -> dict[str, AnyArray]:
         """Return the stored layers of samples, each of shape (B, px, px): as ``dataset.json`` says of each."""
         return self.view.stored.gather(self.view.at[indices], self.view.form.layers)
 

@@ -15,11 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from tcpipe import __version__
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Texts
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import UsageError, clean_lines
 from tcpipe.formats.atomic import Location, write_text
@@ -164,7 +163,7 @@ def _summarize(  # noqa: PLR0917
     kind: str,
     made: Sequence[Evaluation],
     tables: Sequence[pa.Table],
-    runs: NDArray[np.str_],
+    runs: Texts,
     training_s: float,
 ) -> Iterator[BenchmarkRow]:
     splits, classes = (to_texts(tables[0].column(column)) for column in ("split", "terrain_name"))
@@ -188,7 +187,7 @@ def _summarize(  # noqa: PLR0917
                 )  # fmt: skip
 
 
-def estimate_rmse(off: Floats, runs: NDArray[np.str_]) -> Ratio:
+def estimate_rmse(off: Floats, runs: Texts) -> Ratio:
     """Return the root mean square of errors, shape (trainings, N), with its 95 % interval.
 
     The variance of the mean square is that between runs, whose samples correlate, and that between trainings over their

@@ -18,13 +18,13 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import AnyArray, Ints, Texts
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
@@ -211,9 +211,7 @@ def _open_layer_array(
     )
 
 
-def make_parquet_writers(
-    out: Place, pixels: Pixels, samples: Callable[[Ints], pa.Table], split: NDArray[np.str_]
-) -> list[Drawer]:
+def make_parquet_writers(out: Place, pixels: Pixels, samples: Callable[[Ints], pa.Table], split: Texts) -> list[Drawer]:
     """Write ``data/<split>-*.parquet`` to ``out``: the columns of the samples, and each layer as a fixed-size list.
 
     ``samples`` gives rows of the samples table.
@@ -352,9 +350,7 @@ class PatchFiles:
                     array = self.arrays[layer]
                     array.expect((piece, *(0 for _ in array.shape[1:])) for piece in pieces)
 
-    def read(
-        self, piece: int, layers: Iterable[str], out: Mapping[str, NDArray[Any]] | None = None
-    ) -> dict[str, NDArray[Any]]:
+    def read(self, piece: int, layers: Iterable[str], out: Mapping[str, AnyArray] | None = None) -> dict[str, AnyArray]:
         """Return layers of one piece, each of shape (rows, *patch); `DatasetError` if it cannot be read.
 
         ``out`` has `piece_rows` or more rows a layer; None makes new arrays.

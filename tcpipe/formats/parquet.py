@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import DTypeLike, NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import AnyArray, Floats, Ints
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import Location, write_atomic_file
 from tcpipe.formats.json_files import to_json_line
@@ -324,7 +324,7 @@ def take_rows(table: pa.Table, rows: Ints) -> pa.Table:
     return pa.Table.from_batches(taken, table.schema).take(pa.array(back))
 
 
-def make_mapped_array(directory: Path, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+def make_mapped_array(directory: Path, shape: tuple[int, ...], dtype: DTypeLike) -> AnyArray:
     """Return an array of zeros in a nameless file in a directory, so that the system can free its memory."""
     size_bytes = np.dtype(dtype).itemsize * math.prod(shape)
     if not size_bytes:

@@ -23,6 +23,7 @@ import numcodecs
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import AnyArray
 from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import read_json
 
@@ -136,7 +137,7 @@ class ShardedArray:
     """Where the shards are; None: on this machine."""
     _indices: dict[tuple[int, ...], NDArray[np.uint64]] = field(default_factory=dict)
 
-    def chunk(self, index: tuple[int, ...], out: NDArray[Any] | None = None) -> NDArray[Any]:
+    def chunk(self, index: tuple[int, ...], out: AnyArray | None = None) -> AnyArray:
         """Return a whole chunk even at the array's end, shape ``chunk_shape``; in ``out`` (contiguous) if given."""
         shard, place = self._shard_and_place(index)
         out = np.empty(self.chunk_shape, self.dtype) if out is None else out
@@ -178,7 +179,7 @@ class ShardedArray:
         shard = tuple(i // n for i, n in zip(index, per_shard, strict=True))
         return shard, tuple(i % n for i, n in zip(index, per_shard, strict=True))
 
-    def window(self, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
+    def window(self, row0: int, row1: int, col0: int, col1: int) -> AnyArray:
         """Return rows ``row0:row1`` and columns ``col0:col1`` of the last two axes; `StoreError` as `chunk`."""
         high, wide = self.chunk_shape[-2:]
         row1, col1 = min(row1, self.shape[-2]), min(col1, self.shape[-1])
@@ -193,7 +194,7 @@ class ShardedArray:
             out[top - row0 : bottom - row0, left - col0 : right - col0] = part
         return out
 
-    def encoded_shard(self, values: NDArray[Any], *, threads: int = 1) -> bytes:
+    def encoded_shard(self, values: AnyArray, *, threads: int = 1) -> bytes:
         """Return the file of a shard with ``values`` at its corner; the rest of its last chunks is fill value.
 
         ``threads`` encode chunks side by side; the bytes do not depend on their number.
@@ -215,7 +216,7 @@ class ShardedArray:
         """Return the name of a shard's file, below the array's directory, from its number along each axis."""
         return "/".join(("c", *map(str, shard)))
 
-    def _encoded(self, values: NDArray[Any], place: tuple[int, ...]) -> bytes:
+    def _encoded(self, values: AnyArray, place: tuple[int, ...]) -> bytes:
         cut = tuple(slice(i * c, (i + 1) * c) for i, c in zip(place, self.chunk_shape, strict=True))
         chunk = values[cut]
         if chunk.shape != self.chunk_shape:
@@ -296,7 +297,7 @@ def _make_codec(name: str, configuration: Mapping[str, Any]) -> Any:
     return numcodecs.Blosc(cname=cname, clevel=clevel, shuffle=shuffle, blocksize=blocksize)
 
 
-def _decode(codec: Any, data: bytes, out: NDArray[Any]) -> None:
+def _decode(codec: Any, data: bytes, out: AnyArray) -> None:
     """Fill ``out`` with what is encoded; `ValueError` where that is more or less."""
     size = int.from_bytes(data[4:8], "little") if isinstance(codec, numcodecs.Blosc) else _read_zstd_size(data)
     if size != out.nbytes:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import GenericArray
 from tcpipe.cost.prediction_errors import Residuals, make_residuals
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import available_features, read_extra_features
@@ -120,7 +120,7 @@ def _fit_baseline(kind: type[Predictor], train: Split, data: Dataset) -> tuple[S
     return samples, fitted.predictor, fitted.held_out
 
 
-def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:
+def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], GenericArray]:
     """Return groups of samples with correlated errors: runs where there are enough, else blocks of ground."""
     runs = split.column("run_id").astype(np.str_)
     if len(np.unique(runs)) >= FEWEST_GROUPS:

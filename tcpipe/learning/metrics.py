@@ -19,10 +19,9 @@ from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, GenericArray, Ints, Mask
 from tcpipe.tables.findings import omit
 
 QUANTITIES = ("w", "v", "T", "E")
@@ -165,9 +164,7 @@ PATH_M = 30
 """Length of the paths by whose sums a model is judged, in samples of about a metre."""
 
 
-def compute_path_error(
-    predicted: Floats, measured: Floats, runs: NDArray[np.generic], start_ns: NDArray[np.generic]
-) -> float:
+def compute_path_error(predicted: Floats, measured: Floats, runs: GenericArray, start_ns: GenericArray) -> float:
     """Return the error of sums over consecutive paths of `PATH_M` samples of a run [%]: RMS over the mean sum.
 
     All arrays have shape (N,); the rest of a run counts as a path if it is its only one.
@@ -210,7 +207,7 @@ class Ratio:
         return f"{self.value:.2f}" + ("" if self.low is None else f" ({self.low:.2f} to {self.high:.2f})")
 
 
-def compare_errors(ours: Floats, theirs: Floats, groups: NDArray[np.generic], *, seed: int) -> Ratio:
+def compare_errors(ours: Floats, theirs: Floats, groups: GenericArray, *, seed: int) -> Ratio:
     """Return the ratio of two RMSE over the same samples with its interval.
 
     Groups are drawn anew with all of their samples, the same ones for both sides. Quantiles of the logarithm are

@@ -19,9 +19,8 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Floats32, Mask
+from tcpipe.arrays import Floats, Floats32, GenericArray, Mask
 from tcpipe.cost.prediction_errors import QuantityErrors, estimate_correlation, fit_errors
 from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
 from tcpipe.errors import ModelError, StoreError, UsageError
@@ -40,7 +39,7 @@ from tcpipe.splits.audit import CLOSE, are_near
 
 logger = logging.getLogger("tcpipe")
 
-Arrays = Mapping[str, NDArray[np.generic]]
+Arrays = Mapping[str, GenericArray]
 
 FILES = CARD, WEIGHTS, RESIDUALS, GROUND, HISTORY = (
     "model.json",
@@ -65,7 +64,7 @@ class Model:
     place: Path
     checksum: str
     """Checksum of card and weights, which determine its predictions."""
-    residuals: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
+    residuals: Mapping[str, GenericArray] = field(default_factory=dict)
     """Columns of the held-out samples: run_id, start_ns, terrain_class, labels, predictions."""
     own: OwnKind | None = None
     """The user's code."""

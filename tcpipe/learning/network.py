@@ -17,16 +17,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 from torch.nn import functional
 
-from tcpipe.arrays import Floats32
+from tcpipe.arrays import Floats32, GenericArray
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import check_arrays
 from tcpipe.learning.fitting import mean_loss
 
-Arrays = Mapping[str, NDArray[np.generic]]
+Arrays = Mapping[str, GenericArray]
 
 _TOGETHER = 256
 """Patches in one forward pass."""

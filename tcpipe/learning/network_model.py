@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats32
+from tcpipe.arrays import Floats32, GenericArray
 from tcpipe.dataset.extra_features import (
     COLUMNS,
     ExtraFeatures,
@@ -38,7 +37,7 @@ from tcpipe.learning.predictor import (
 if TYPE_CHECKING:
     from tcpipe.learning.network import ResNet18, Trainer
 
-Arrays = Mapping[str, NDArray[np.generic]]
+Arrays = Mapping[str, GenericArray]
 
 logger = logging.getLogger("tcpipe")
 

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import AnyArray, Floats, GenericArray, Ints
 from tcpipe.cost.physics import ALL, FEWEST, FitSamples, Physics, fit_physics
 from tcpipe.dataset import Split
 from tcpipe.dataset.energies import ENERGIES
@@ -67,12 +66,12 @@ class PhysicsModel(Predictor):
         """Fit it to samples."""
         return fit_physics_model(samples.features, samples.labels, idle_watt=samples.idle_watt)
 
-    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
+    def to_arrays(self) -> dict[str, GenericArray]:
         """Return everything by name."""
         return {**{name: getattr(self, name) for name in _NUMBERS}, **self.speed.arrays()}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> PhysicsModel:
+    def from_arrays(cls, arrays: Mapping[str, AnyArray], inputs: Inputs) -> PhysicsModel:
         """Return the model of these arrays."""
         del inputs
         check_arrays(arrays, {**_FORMS, **list_curve_arrays(1)})
@@ -164,7 +163,7 @@ class Curves:
             out[class_id == known] = made[class_id == known] @ numbers
         return out
 
-    def arrays(self) -> dict[str, NDArray[np.generic]]:
+    def arrays(self) -> dict[str, GenericArray]:
         """Return the arrays by name, as `read_curves` takes them."""
         return {f"{_STORED}{name}": getattr(self, name) for name in _ARRAYS}
 
@@ -184,7 +183,7 @@ def list_curve_arrays(outputs: int) -> dict[str, ArrayForm]:
     return {f"{_STORED}{name}": form for name, form in forms.items()}
 
 
-def read_curves(arrays: Mapping[str, NDArray[Any]]) -> tuple[Curves, dict[str, NDArray[Any]]]:
+def read_curves(arrays: Mapping[str, AnyArray]) -> tuple[Curves, dict[str, AnyArray]]:
     """Return the curves of `Curves.arrays` and the other arrays; `ModelError` without valid curves."""
     rest = dict(arrays)
     curves = Curves(*(rest.pop(f"{_STORED}{name}") for name in _ARRAYS))
@@ -217,12 +216,12 @@ class CurveModel(Predictor):
         of = samples.features
         return cls(fit_curves(of.slope_rad, of.class_id, samples.labels, quantiles=cls.quantiles))
 
-    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
+    def to_arrays(self) -> dict[str, GenericArray]:
         """Return the curves by name."""
         return self.curves.arrays()
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> CurveModel:
+    def from_arrays(cls, arrays: Mapping[str, AnyArray], inputs: Inputs) -> CurveModel:
         """Return the model of these curves."""
         check_arrays(arrays, list_curve_arrays(len(inputs.outputs)))
         return cls(read_curves(arrays)[0])

@@ -26,12 +26,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeAlias, cast
+from typing import ClassVar, Protocol, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Floats32, Ints, Mask
+from tcpipe.arrays import AnyArray, Floats, Floats32, GenericArray, Ints, Mask
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeature, ExtraFeatures, read_extra_features
 from tcpipe.errors import ModelError
@@ -39,7 +39,7 @@ from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes, compute
 
 Patches: TypeAlias = Floats32
 Labels: TypeAlias = NDArray[np.floating]
-Arrays: TypeAlias = Mapping[str, NDArray[Any]]
+Arrays: TypeAlias = Mapping[str, AnyArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,7 @@ class Samples:
         return self.split.labels.astype(np.float64)
 
     @property
-    def folds(self) -> NDArray[np.generic]:
+    def folds(self) -> GenericArray:
         """Fold of each sample for cross-validation; a fold is a set of blocks of ground, or of runs."""
         return self.split.column("fold")
 
@@ -228,7 +228,7 @@ def find_kind(name: ModelKind) -> type[Predictor]:
     return cast("type[Predictor]", getattr(import_module(module), attribute))
 
 
-def cross_predict(kind: type[Predictor], samples: Samples, parts: NDArray[np.generic]) -> Prediction:
+def cross_predict(kind: type[Predictor], samples: Samples, parts: GenericArray) -> Prediction:
     """Return predictions of each part of the samples by a model of the others."""
     require_folds(parts)
     out = Prediction.without_covariance(np.empty_like(samples.labels))
@@ -239,7 +239,7 @@ def cross_predict(kind: type[Predictor], samples: Samples, parts: NDArray[np.gen
     return out
 
 
-def require_folds(folds: NDArray[np.generic]) -> None:
+def require_folds(folds: GenericArray) -> None:
     """Raise `ModelError` unless there are two folds or more."""
     if len(np.unique(folds)) < 2:
         raise ModelError(f"{len(folds)} training samples are in one fold, expected two or more")

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Floats32, Ints
+from tcpipe.arrays import AnyArray, Floats, Floats32, GenericArray, Ints
 from tcpipe.dataset.extra_features import ExtraFeatures, standardize_features
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm, check_arrays
@@ -167,7 +167,7 @@ def clean_trees(text: str, features: int) -> str:
 
 
 def grow(
-    features: Floats, labels: Floats, folds: NDArray[np.generic], config: TrainConfig | None = None
+    features: Floats, labels: Floats, folds: GenericArray, config: TrainConfig | None = None
 ) -> tuple[tuple[str, ...], Floats, int]:
     """Fit trees of every output, as many as are best where each fold is predicted by the others.
 
@@ -243,13 +243,13 @@ class BoostingModel(Predictor):
             out[rows] = self.predict_table(np.column_stack([plain, numbers[rows]]))
         return out
 
-    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
+    def to_arrays(self) -> dict[str, GenericArray]:
         """Return curves and trees by name."""
         texts = {f"trees_{at}": np.frombuffer(text.encode(), np.uint8) for at, text in enumerate(self.trees)}
         return {**texts, **self.curves.arrays()}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], inputs: Inputs) -> BoostingModel:
+    def from_arrays(cls, arrays: Mapping[str, AnyArray], inputs: Inputs) -> BoostingModel:
         """Return the model of these arrays."""
         texts: dict[str, ArrayForm] = {f"trees_{at}": ("uint8", (f"bytes_{at}",)) for at in range(len(inputs.outputs))}
         check_arrays(arrays, {**texts, **list_curve_arrays(len(inputs.outputs))})
@@ -290,7 +290,7 @@ def _compute_features(patches: Patches, inputs: Inputs) -> Floats:
 
 
 def fit_table(
-    features: Floats, labels: Floats, folds: NDArray[np.generic], inputs: Inputs, config: TrainConfig | None = None
+    features: Floats, labels: Floats, folds: GenericArray, inputs: Inputs, config: TrainConfig | None = None
 ) -> tuple[BoostingModel, Floats, int]:
     """Fit curves, and trees to the residuals of curves of the other folds.
 

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints, Mask
+from tcpipe.arrays import AnyArray, Ints, Mask
 from tcpipe.tables.facts import ClockStep
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
@@ -71,7 +71,7 @@ class TopicTimes:
 
     log_time_ns: Ints
     header_ns: Ints | None
-    content: Sequence[NDArray[Any]]
+    content: Sequence[AnyArray]
     prefer: Literal["auto", "header", "log"] = "auto"
     offset_ns: int = 0
 

@@ -11,12 +11,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import AnyArray, Floats, Ints
 from tcpipe.logs import roles
 from tcpipe.logs.expressions import (
     FORM,
@@ -33,8 +31,7 @@ from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity
 
-Array = NDArray[Any]
-Columns = Mapping[str, Array]
+Columns = Mapping[str, AnyArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +154,7 @@ class FieldSource:
     factor: float
     codes: str | None
 
-    def evaluate(self, read: Callable[[str, int | None], Array], rows: int) -> Floats:
+    def evaluate(self, read: Callable[[str, int | None], AnyArray], rows: int) -> Floats:
         """Return the values, shape (rows,); ``read`` as in `Expression.evaluate`."""
         values = np.broadcast_to(self.expression.evaluate(read), rows)
         return self.factor * values if self.codes is None else classify_fixes(values, self.codes)
@@ -232,14 +229,14 @@ _CLEARLY_A_UNIT = 2
 """Characters: what is shorter at the end of a name may be something else."""
 
 
-def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, Array]:
+def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, AnyArray]:
     """Return the fields of the message that a role usually has, by dotted name, from those that are mapped.
 
     What is not mapped is what the message has for unknown: no orientation, no covariance, no altitude (NaN), a fix,
     zero elsewhere. ``values`` are by short name, in the units of `MAPPED`, shape (rows,).
     """
     zero = np.zeros(rows)
-    made: dict[str, Array] = {}
+    made: dict[str, AnyArray] = {}
     for name, field in MAPPED[role].items():
         if field.std_of is not None:
             if name in values:
@@ -258,7 +255,7 @@ def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> d
     return made | _collect_other_fields(role, values, made, rows)
 
 
-def _collect_other_fields(role: str, values: Mapping[str, Floats], made: Columns, rows: int) -> dict[str, Array]:
+def _collect_other_fields(role: str, values: Mapping[str, Floats], made: Columns, rows: int) -> dict[str, AnyArray]:
     """Return the fields of a role's message that no mapping names."""
     if role == "gnss":
         status = made["status.status"]
@@ -285,7 +282,7 @@ def find_topic(name: str, role: str, columns: Collection[str], power_type: str |
     return f"/{name}" if find_quantity(name) == alone else f"/{name}/{alone}", FLOAT_TYPES[1]
 
 
-def parse_stamps_ns(values: Array, unit: str) -> Ints | str:
+def parse_stamps_ns(values: AnyArray, unit: str) -> Ints | str:
     """Return finite numbers, shape (N,), as [ns], or why they are no stamps.
 
     ``unit`` is s, ms, us or ns; auto infers it from their size, since 1979.
@@ -310,7 +307,7 @@ def utc_from_gps_ns(stamp_ns: Ints) -> Ints:
     return stamp_ns - leap_s * 1_000_000_000
 
 
-def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, Array] | list[str]:
+def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, AnyArray] | list[str]:
     """Return a custom message's columns as those of the role's usual message, or the problems of the mapping.
 
     ``fields`` are by short name what each is taken from: ``pvt.lat``, ``accel[0]``, ``lat * 1e-7``.
@@ -339,7 +336,7 @@ def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) 
     return own | stamps | make_message_fields(role, values, rows)
 
 
-def _find_misfit(values: Array, name: str, index: int | None, *, may_be_text: bool) -> str | None:
+def _find_misfit(values: AnyArray, name: str, index: int | None, *, may_be_text: bool) -> str | None:
     """Return why a field of a message is no number a message."""
     if not may_be_text and not np.issubdtype(values.dtype, np.number):
         return f"{name} is text; expected numbers"

@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import AnyArray, Floats, Ints
 from tcpipe.logs.expressions import simplify_name
 
-Array = NDArray[Any]
-Columns = Mapping[str, Array]
+Columns = Mapping[str, AnyArray]
 
 NO_HEIGHT_M2 = 1e6
 """Variance of a height that is not measured."""
@@ -75,7 +73,7 @@ def find_quality(names: Iterable[str]) -> list[str]:
     return found[:1]
 
 
-def classify_fixes(values: Array, codes: str) -> Floats:
+def classify_fixes(values: AnyArray, codes: str) -> Floats:
     """Return the quality of each fix by its code or word, shape (N,): NaN if unknown, negative without a fix."""
     found = np.full(len(values), _NO_FIX)
     if np.issubdtype(values.dtype, np.number):
@@ -98,7 +96,7 @@ def find_status(quality: Floats) -> NDArray[np.int8]:
     return _STATUS[np.where(np.isnan(quality), _FIXED, quality).astype(np.int64)]
 
 
-def convert_gps_fix(columns: Columns) -> dict[str, Array]:
+def convert_gps_fix(columns: Columns) -> dict[str, AnyArray]:
     """Return the fields of gps_common/GPSFix as those of NavSatFix; without a covariance by its errors of 95 %."""
     quality = classify_status(columns["status.status"].astype(np.int64), "gps_common")
     made = {**columns, "fix_quality": quality}
@@ -113,7 +111,7 @@ def convert_gps_fix(columns: Columns) -> dict[str, Array]:
     return made
 
 
-def add_quality_std(columns: Columns, std_m: Mapping[str, float]) -> tuple[dict[str, Array], int]:
+def add_quality_std(columns: Columns, std_m: Mapping[str, float]) -> tuple[dict[str, AnyArray], int]:
     """Return fixes with the σ of their quality if they have none, or one σ for all; and the number of such fixes.
 
     ``std_m`` [m] goes before `FIX_STD_M`; heights have twice as much.

@@ -13,9 +13,8 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import AnyArray, Floats, Ints, Mask
 from tcpipe.geometry.rotation import normalize
 from tcpipe.logs import roles
 from tcpipe.logs.extrinsics import is_base
@@ -49,7 +48,7 @@ class Readings:
     row: Ints
     log_time_ns: Ints
     header_ns: Ints | None
-    columns: dict[str, NDArray[Any]]
+    columns: dict[str, AnyArray]
     dropped: dict[str, int] = field(default_factory=dict)
     notes: dict[str, int] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
@@ -88,7 +87,7 @@ _IMPOSSIBLE = 1e9
 """No position, velocity or acceleration in SI units is larger; squares of what is overflow."""
 
 
-def _mask_impossible(name: str, values: NDArray[Any]) -> NDArray[Any]:
+def _mask_impossible(name: str, values: AnyArray) -> AnyArray:
     """Return the values of a field, NaN for those that no sensor can report; covariances are checked when used."""
     if not np.issubdtype(values.dtype, np.floating) or name.endswith("covariance"):
         return values
@@ -120,9 +119,7 @@ def read_header_ns(columns: Columns) -> Ints | None:
     return columns[_STAMP[0]].astype(np.int64) * 1_000_000_000 + columns[_STAMP[1]].astype(np.int64)
 
 
-def _select_rows(
-    columns: Columns, values: dict[str, NDArray[Any]], drops: Mapping[str, Mask], **extra: Any
-) -> Readings:
+def _select_rows(columns: Columns, values: dict[str, AnyArray], drops: Mapping[str, Mask], **extra: Any) -> Readings:
     """Return the readings of the rows that no reason drops; a row counts under its first reason."""
     keep = np.ones(len(columns[LOG_TIME]), bool)
     dropped: dict[str, int] = {}
@@ -148,7 +145,7 @@ def _read_vector(columns: Columns, prefix: str) -> Floats:
     return np.stack([columns[f"{prefix}.{axis}"].astype(np.float64) for axis in "xyz"], -1)
 
 
-def _name_axes(name: str, suffix: str, values: Floats) -> dict[str, NDArray[Any]]:
+def _name_axes(name: str, suffix: str, values: Floats) -> dict[str, AnyArray]:
     return {f"{name}_{axis}_{suffix}": values[:, i] for i, axis in enumerate("xyz")}
 
 
@@ -204,7 +201,7 @@ def _is_outside(lat_deg: Floats, lon_deg: Floats) -> Mask:
     return (np.abs(lat_deg) > 90) | (np.abs(lon_deg) > 180)
 
 
-def _read_gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, quality: Floats) -> dict[str, NDArray[Any]]:
+def _read_gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, quality: Floats) -> dict[str, AnyArray]:
     return {
         "lon_deg": lon,
         "lat_deg": lat,
@@ -296,9 +293,7 @@ def find_utc_offset(readings: Readings) -> tuple[Finding, ...]:
     return (make_finding("utc-differs-from-header", GNSS, offset_s=apart_s, remedies=remedies),)
 
 
-def _make_ground_velocity(
-    velocity: Floats, variances: Floats, status: NDArray[Any] | int = -1
-) -> dict[str, NDArray[Any]]:
+def _make_ground_velocity(velocity: Floats, variances: Floats, status: AnyArray | int = -1) -> dict[str, AnyArray]:
     """Return the columns of velocities east, north, up (N, 3) and their variances."""
     axes = ("east", "north", "up")
     return {
@@ -439,7 +434,7 @@ def _read_imu(columns: Columns) -> Readings:
 _POSE = ("x_m", "y_m", "z_m", "quat_x", "quat_y", "quat_z", "quat_w")
 
 
-def _read_body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[dict[str, NDArray[Any]], Floats]:
+def _read_body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[dict[str, AnyArray], Floats]:
     """Return a twist's columns, null where it is not measured, and the twist as published, shape (N, 6)."""
     linear, angular = _read_vector(columns, f"{prefix}.linear"), _read_vector(columns, f"{prefix}.angular")
     twist = np.concatenate((linear, angular), -1)
@@ -482,7 +477,7 @@ def _read_twist_stamped(columns: Columns) -> Readings:
 def _read_command(columns: Columns) -> Readings:
     prefix = "twist." if "twist.linear.x" in columns else ""
     forward, yaw_rate = (columns[f"{prefix}{name}"].astype(np.float64) for name in ("linear.x", "angular.z"))
-    values: dict[str, NDArray[Any]] = {"forward_velocity_mps": forward, "yaw_rate_radps": yaw_rate}
+    values: dict[str, AnyArray] = {"forward_velocity_mps": forward, "yaw_rate_radps": yaw_rate}
     return _select_rows(columns, values, {"not_finite": ~np.isfinite(forward + yaw_rate)})
 
 
@@ -494,7 +489,7 @@ def _read_pose(columns: Columns) -> Readings:
         quat[:] = np.nan
     if np.all(place[:, 2] == place[:1, 2]):  # a map in the plane
         variances[:, 2] = NO_HEIGHT_M2
-    values: dict[str, NDArray[Any]] = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
+    values: dict[str, AnyArray] = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
     values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), np.full(len(place), np.nan))
     values |= {f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))}
     values |= {f"quat_{c}": quat[:, i] for i, c in enumerate("xyzw")}

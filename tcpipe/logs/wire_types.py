@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, Ints, Mask
+from tcpipe.arrays import Bytes, GenericArray, Ints, Mask
 from tcpipe.logs.topics import normalize_type_name
 
 MAX_COLUMNS = 20_000
@@ -195,12 +195,12 @@ class Grid:
     shape: tuple[int, ...]
     strides: tuple[int, ...]
 
-    def view(self, data: Bytes, dtype: np.dtype[np.generic], count: int = 1) -> NDArray[np.generic]:
+    def view(self, data: Bytes, dtype: np.dtype[np.generic], count: int = 1) -> GenericArray:
         """Return a copy of the values there, ``count`` side by side at each place, in the order of `list_offsets`."""
         together = dtype if count == 1 else np.dtype(f"V{count * dtype.itemsize}")  # many at once are copied faster
         if not count:
             return np.zeros(0, dtype)
-        found: NDArray[np.generic] = np.ndarray(self.shape, together, data, self.first, self.strides)
+        found: GenericArray = np.ndarray(self.shape, together, data, self.first, self.strides)
         return found.copy().reshape(-1).view(dtype)
 
     def list_offsets(self) -> Ints:

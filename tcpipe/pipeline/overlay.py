@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import AnyArray, Ints, Texts
 from tcpipe.errors import LogError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.logs.log_file import open_log
@@ -161,7 +160,7 @@ def _find_recorder_clock(run: StoredRun) -> _Clock:
     return _Clock(max(tables, key=lambda table: table.num_rows))
 
 
-def _read_column(table: pa.Table, name: str) -> NDArray[Any]:
+def _read_column(table: pa.Table, name: str) -> AnyArray:
     return to_numbers(table.column(name))
 
 
@@ -172,7 +171,7 @@ def _add_bit_names(table: pa.Table, column: str, flags: type[DropReason | Qualit
     return table.append_column(name, make_text_column([texts[int(value)] for value in bits]))
 
 
-def _make_header(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
+def _make_header(stamp_ns: Ints) -> dict[str, AnyArray]:
     return {"header.stamp.sec": stamp_ns // 10**9, "header.stamp.nanosec": stamp_ns % 10**9}
 
 
@@ -189,7 +188,7 @@ def _make_fixes(rows: pa.Table, times: Ints) -> MessageStream:
     return MessageStream(f"{OVERLAY}fix", NAV_SAT_FIX, times, columns | {"position_covariance": covariance}, constants)
 
 
-def _iterate_masks(reasons: NDArray[np.str_], times: Ints) -> Iterator[MessageStream]:
+def _iterate_masks(reasons: Texts, times: Ints) -> Iterator[MessageStream]:
     """Yield why rows are not used, a message where that changes."""
     changes = np.flatnonzero(np.append(True, reasons[1:] != reasons[:-1])[: len(reasons)])
     for reason in np.unique(reasons):

@@ -12,9 +12,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, Floats, Floats32, Ints, Mask
+from tcpipe.arrays import Bytes, Floats, Floats32, GenericArray, Ints, Mask
 from tcpipe.errors import MapError
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_model import BATCH, NO_COST, Bits, Reason, SegmentPredictions, iterate_predictions
@@ -133,12 +132,12 @@ class CostGrid:
         forbidden = np.uint16(BARRED) if allow_extrapolation else np.uint16(0xFFFF)
         return np.asarray(self.reasons & forbidden == 0)
 
-    def take(self, cells: Cells) -> dict[str, NDArray[np.generic]]:
+    def take(self, cells: Cells) -> dict[str, GenericArray]:
         """Return all that is known of cells (flat indices, (n,)) by name."""
         shapes = {"power_watt": COURSES, "velocity_mps": COURSES, "reasons": COURSES, "height_m": 1}
         return {name: getattr(self, name).reshape(count, -1)[:, cells] for name, count in shapes.items()}
 
-    def load(self, cells: Cells, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+    def load(self, cells: Cells, arrays: Mapping[str, GenericArray]) -> None:
         """Write the arrays of `take`."""
         for name, values in arrays.items():
             getattr(self, name).reshape(len(values), -1)[:, cells] = values

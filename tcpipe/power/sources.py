@@ -20,15 +20,14 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import AnyArray, Floats, Ints, Mask, Texts
 from tcpipe.power.plausibility import REJECTED
 from tcpipe.power.rails import UNIT_VOLT, is_power_only
 from tcpipe.robots import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
-Columns = Mapping[str, NDArray[Any]]
+Columns = Mapping[str, AnyArray]
 HuskyPower = Literal["battery", "drivers"]
 
 NAMES, SPEED, TORQUE = "name[]", "velocity", "effort"
@@ -57,7 +56,7 @@ def select_joints(columns: Columns, source: PowerSource) -> JointMotion:
     return JointMotion(tuple(joints), source.torque_scale * values[0], source.speed_scale * values[1])
 
 
-def _find_layouts(names: NDArray[np.str_]) -> dict[tuple[str, ...], Ints]:
+def _find_layouts(names: Texts) -> dict[tuple[str, ...], Ints]:
     """Return the rows of at least one message, shape (N, k), by their lists of names."""
     first = np.flatnonzero(np.concatenate(([True], (names[1:] != names[:-1]).any(axis=1))))
     found: dict[tuple[str, ...], list[Ints]] = {}

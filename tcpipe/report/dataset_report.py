@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial import cKDTree
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import AnyInts, Floats
 from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_card import LOCAL, DatasetCard, group_dataset_findings, judge_dataset
 from tcpipe.formats.dataset_files import read_intact_card, read_samples, sample_columns
@@ -237,7 +237,7 @@ def _make_provenance_section(card: DatasetCard) -> PageSection:
     return PageSection("Provenance", text, header=("what", "is"), rows=rows, folded=True)
 
 
-def find_nearest_train_m(xy_m: Floats, split: NDArray[np.integer]) -> tuple[Floats, NDArray[np.int32]]:
+def find_nearest_train_m(xy_m: Floats, split: AnyInts) -> tuple[Floats, NDArray[np.int32]]:
     """Return distance [m] and row of the nearest training sample of each held-out sample, shape (N,); NaN elsewhere.
 
     ``split`` is the number of each sample's split in `SPLITS`, shape (N,).

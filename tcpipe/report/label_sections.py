@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import AnyInts
 from tcpipe.formats.finding_lines import advise_on_loss, format_budget
 from tcpipe.motion.distance_breakdown import find_largest_losses
 from tcpipe.report.page import PageSection
@@ -64,13 +64,13 @@ def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *,
     return [PageSection("Distance breakdown", text, header=header, rows=rows, plots=[draw_waterfall(total_m)])]
 
 
-def find_distinguishing_bits(bits: NDArray[np.integer]) -> int:
+def find_distinguishing_bits(bits: AnyInts) -> int:
     """Return the quality bits that some but not all labels have; only these are useful on a map."""
     bits = bits.astype(np.int64)
     return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
 
 
-def make_quality_section(bits: NDArray[np.integer], noun: str) -> PageSection:
+def make_quality_section(bits: AnyInts, noun: str) -> PageSection:
     """Return how many labels carry each quality bit."""
     counts = {flag_name(bit).replace("_", " "): int(((bits & int(bit)) != 0).sum()) for bit in Quality}
     rows = [item for item in counts.items() if item[1]]

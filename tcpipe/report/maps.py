@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from pyproj import Transformer
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Bytes, Floats
 from tcpipe.errors import StoreError, TcpipeError, clean_line
 from tcpipe.formats.dataset_card import LOCAL, DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, OVERVIEW, RELIEF
@@ -291,7 +290,7 @@ def _draw_track(axes: tuple[str, str], xy_m: Floats, legend: Mapping[str, str]) 
 
 def _draw_pictures(source: MapFile) -> Pictures:
     layers = source.layers
-    draw: dict[str, Callable[[MapFile], NDArray[np.uint8]]] = {}
+    draw: dict[str, Callable[[MapFile], Bytes]] = {}
     if "ortho" in layers:
         draw["orthophoto"] = draw_ortho
     draw["hillshade"] = draw_relief

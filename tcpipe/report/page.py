@@ -32,9 +32,9 @@ from urllib.parse import quote
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
-from numpy.typing import NDArray
 
 from tcpipe import __version__
+from tcpipe.arrays import Floats, GenericArray
 from tcpipe.errors import clean_line
 from tcpipe.formats.finding_lines import (
     MOST_LINES,
@@ -264,7 +264,7 @@ def _format_breakable(cell: object) -> str:
 
 
 Kind = Literal["u8", "u16", "u32", "f32", "half", "steps"]
-Column = tuple[Kind, NDArray[np.generic]]
+Column = tuple[Kind, GenericArray]
 
 _WHOLE = {"u8": "<u1", "u16": "<u2", "u32": "<u4"}
 
@@ -281,18 +281,18 @@ def pack_columns(columns: Mapping[str, Column]) -> Json:
     return {"columns": described, "data": base64.b64encode(zlib.compress(bytes(blob), 6)).decode("ascii")}
 
 
-def make_shown_column(digits: int, values: NDArray[np.float64]) -> Column:
+def make_shown_column(digits: int, values: Floats) -> Column:
     """Return a column that is shown with so many decimals: in steps where these are finer than half of the last one."""
     return ("steps" if _scale(values)[1] < 0.5 * 10.0**-digits else "f32"), values
 
 
-def _scale(values: NDArray[np.generic]) -> tuple[float, float]:
+def _scale(values: GenericArray) -> tuple[float, float]:
     numbers = values.astype(np.float64)
     known = numbers[np.isfinite(numbers)]
     return (float(known.min()), (float(known.max()) - float(known.min())) / 65534 or 1.0) if len(known) else (0.0, 1.0)
 
 
-def _to_bytes(kind: Kind, values: NDArray[np.generic], low: float, step: float) -> bytes:
+def _to_bytes(kind: Kind, values: GenericArray, low: float, step: float) -> bytes:
     if kind in _WHOLE:
         return values.astype(_WHOLE[kind]).tobytes()
     if kind == "steps":

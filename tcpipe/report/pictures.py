@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from PIL import Image, ImageColor, UnidentifiedImageError
 from pyproj import Transformer
 
+from tcpipe.arrays import AnyArray, Bytes, Floats, GenericArray, Ints
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches
@@ -23,8 +23,6 @@ from tcpipe.formats.maps.map_files import PICTURE_PX, MapFile
 from tcpipe.report.colours import choose_class_colours
 from tcpipe.tables.columns import to_floats
 from tcpipe.terrain.layers import COLOURS, MAX_ID, ClassTable, Layer, Pixels
-
-Bytes = NDArray[np.uint8]
 
 ACROSS = 25
 """Patches in one row of a sheet."""
@@ -53,7 +51,7 @@ def read_picture(path: Path) -> Bytes | None:
         return None
 
 
-def make_sheet(patches: NDArray[np.uint8]) -> Bytes:
+def make_sheet(patches: Bytes) -> Bytes:
     """Return patches (N, px, px) or (N, px, px, 3) side by side, `ACROSS` in a row, the rest black."""
     count, px = patches.shape[:2]
     rows = -(-count // ACROSS)
@@ -63,7 +61,7 @@ def make_sheet(patches: NDArray[np.uint8]) -> Bytes:
     return np.ascontiguousarray(whole.reshape(rows * px, ACROSS * px, *patches.shape[3:]))
 
 
-def colour_classes(ids: NDArray[np.generic], classes: ClassTable | None) -> Bytes:
+def colour_classes(ids: GenericArray, classes: ClassTable | None) -> Bytes:
     """Return class ids of any shape as colours, one axis more; 0, no data, is white."""
     table = np.full((MAX_ID + 1, 3), 255, np.uint8)
     for number, colour in choose_class_colours(classes.classes if classes else ()).items():
@@ -72,7 +70,7 @@ def colour_classes(ids: NDArray[np.generic], classes: ClassTable | None) -> Byte
     return picture
 
 
-def colour_heights(values: NDArray[np.float64]) -> Bytes:
+def colour_heights(values: Floats) -> Bytes:
     """Return each patch (N, px, px) over its range from dark blue to yellow, (N, px, px, 3), no data white."""
     known = np.isfinite(values)
     low = np.where(known, values, np.inf).min(axis=(1, 2), keepdims=True)
@@ -98,7 +96,7 @@ def compute_joint_bounds_m(places: Sequence[tuple[str, Bounds]]) -> Bounds:
     return float(low[0]), float(low[1]), float(high[2]), float(high[3])
 
 
-def draw_ortho(source: MapFile) -> NDArray[np.uint8]:
+def draw_ortho(source: MapFile) -> Bytes:
     """Return the orthophoto, in colour (R, C, 3) or grey (R, C), no data in white; a shaded relief without one."""
     if (picture := source.read_picture()) is not None:
         return picture
@@ -108,13 +106,13 @@ def draw_ortho(source: MapFile) -> NDArray[np.uint8]:
     return np.where(grey, grey, 255).astype(np.uint8)
 
 
-def draw_relief(source: MapFile) -> NDArray[np.uint8]:
+def draw_relief(source: MapFile) -> Bytes:
     """Return a shaded relief, shape (R, C)."""
     level, step = _level(source)
     return shade_heights(_thin_layer(level, step, "height"), step * level.grid.pixel_size_m)
 
 
-def draw_classes(source: MapFile) -> NDArray[np.uint8]:
+def draw_classes(source: MapFile) -> Bytes:
     """Return the terrain classes in their colours, shape (R, C, 3); white without a terrain layer."""
     level, step = _level(source)
     if "terrain" not in level.layers:
@@ -122,9 +120,7 @@ def draw_classes(source: MapFile) -> NDArray[np.uint8]:
     return colour_classes(_thin_layer(level, step, "terrain"), level.layers["terrain"].classes)
 
 
-def draw_maps(
-    sources: Sequence[MapFile], look: Callable[[MapFile], NDArray[np.uint8]] = draw_ortho
-) -> NDArray[np.uint8]:
+def draw_maps(sources: Sequence[MapFile], look: Callable[[MapFile], Bytes] = draw_ortho) -> Bytes:
     """Return one picture of all maps over their joint bounds, each by ``look``; the first rules where they overlap."""
     if len(sources) == 1:
         return look(sources[0])
@@ -170,7 +166,7 @@ def _thin_layer(level: MapFile, step: int, layer: str) -> Pixels:
     return np.block(blocks)
 
 
-def shade_heights(height_m: NDArray[np.generic], pixel_size_m: float) -> NDArray[np.uint8]:
+def shade_heights(height_m: GenericArray, pixel_size_m: float) -> Bytes:
     """Return Lambert shading of a height field lit from the north-west, 45° above the horizon; no data is white."""
     down, right = np.gradient(height_m.astype(float), pixel_size_m)
     light = (1.0 + right / np.sqrt(2.0) + down / np.sqrt(2.0)) / np.sqrt(2.0 * (1.0 + right**2 + down**2))
@@ -180,7 +176,7 @@ def shade_heights(height_m: NDArray[np.generic], pixel_size_m: float) -> NDArray
 _PLAIN_PNG: dict[str, Any] = {"Software": None}
 
 
-def write_overview(path: Path, picture: NDArray[np.uint8]) -> None:
+def write_overview(path: Path, picture: Bytes) -> None:
     """Write a picture, grey (R, C) or colour (R, C, 3), as PNG; the same picture gives the same bytes."""
     from matplotlib.image import imsave  # noqa: PLC0415  a page of a store needs no picture
 
@@ -206,7 +202,7 @@ def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, cou
     files, step = open_patches(directory, card), -(-card.patch_px // _PX)
     place = find_places_in_files(card, samples.column("split").to_numpy(zero_copy_only=False))
     piece = np.searchsorted(files.starts, place, side="right") - 1
-    rows, stacks, layers = _select_rows(samples.slice(0, count), piece[:count]), dict[str, NDArray[Any]](), list[Json]()
+    rows, stacks, layers = _select_rows(samples.slice(0, count), piece[:count]), dict[str, AnyArray](), list[Json]()
     for number in np.unique(piece[rows]).tolist():
         here = np.flatnonzero(piece[rows] == number)
         for layer, pixels in files.read(number, list(files.layers)).items():
@@ -218,7 +214,7 @@ def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, cou
     return {"rows": rows.tolist(), "px": next(iter(stacks.values())).shape[1], "across": ACROSS, "layers": layers}
 
 
-def _select_rows(samples: pa.Table, piece: NDArray[np.int64]) -> NDArray[np.int64]:
+def _select_rows(samples: pa.Table, piece: Ints) -> Ints:
     """Return up to `MOST_PATCHES` rows, rising, in turn from each split, class and 5° of slope: always the same.
 
     ``piece`` is that of each sample's patch, shape (N,).
@@ -237,7 +233,7 @@ def _select_rows(samples: pa.Table, piece: NDArray[np.int64]) -> NDArray[np.int6
     return np.sort(np.array([row for _, row in sorted(order)[:MOST_PATCHES]], np.int64))
 
 
-def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
+def _join_colours(pixels: Mapping[str, AnyArray]) -> Mapping[str, AnyArray]:
     """Return one orthophoto in colour, (N, px, px, 3), in the place of its grey and its three colours."""
     if not set(COLOURS) <= set(pixels):
         return pixels
@@ -245,7 +241,7 @@ def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[An
     return {name: colour if name == "ortho" else stack for name, stack in pixels.items() if name not in COLOURS}
 
 
-def _make_sheet(stack: NDArray[np.generic], layer: Layer) -> tuple[NDArray[np.uint8], bool]:
+def _make_sheet(stack: GenericArray, layer: Layer) -> tuple[Bytes, bool]:
     """Return patches of a layer as one sheet, and whether all pixels count; a photograph over 98 % of its values."""
     if layer.kind == "categorical":
         return make_sheet(colour_classes(stack, layer.classes)), True

@@ -9,8 +9,8 @@ from pathlib import PurePosixPath
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Ints
 from tcpipe.errors import StoreError, TableError
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.json_files import Json
@@ -201,9 +201,7 @@ def _make_segments_data(
     return pack_columns(columns)
 
 
-def _find_severities(
-    columns: Mapping[str, Column], findings: Sequence[Finding], spans: Sequence[FindingSpan]
-) -> NDArray[np.int64]:
+def _find_severities(columns: Mapping[str, Column], findings: Sequence[Finding], spans: Sequence[FindingSpan]) -> Ints:
     """Return the worst severity of each segment, by spans and flags: its place in `SEVERITIES`, or their number."""
     start_s, end_s = (np.asarray(columns[name][1], np.float64) for name in ("start", "end"))
     quality = np.asarray(columns["quality"][1], np.int64)

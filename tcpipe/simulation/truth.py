@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, Floats, Ints
+from tcpipe.arrays import AnyArray, Bytes, Floats, Ints
 from tcpipe.compiled import compile_kernel
 from tcpipe.geometry.rotation import normalize, rpy_from_quat
 
@@ -89,7 +87,7 @@ class Truth:
     def from_table(cls, table: pa.Table) -> Truth:
         """Return the truth that `table` made."""
 
-        def column(name: str) -> NDArray[Any]:
+        def column(name: str) -> AnyArray:
             return np.asarray(table.column(name).to_numpy())
 
         many = {name: np.stack([column(c) for c in columns], axis=-1) for name, columns in _COMPONENTS.items()}

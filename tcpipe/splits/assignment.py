@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Mask
+from tcpipe.arrays import Bytes, Floats, Mask
 from tcpipe.splits.regions import Regions, classify_footprints
 
 Ints = NDArray[np.signedinteger]
@@ -87,7 +87,7 @@ def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: flo
     return test
 
 
-def draw_groups(groups: Groups, arrival: Ints, *, test_fraction: float, seed: int) -> NDArray[np.bool_]:
+def draw_groups(groups: Groups, arrival: Ints, *, test_fraction: float, seed: int) -> Mask:
     """Mark whole groups as test, shape (G,), nearest to a share ``test_fraction`` of the samples.
 
     After each arrival the groups so far are visited by rank; a training group joins test if that brings the share
@@ -154,7 +154,7 @@ def group_by_run(run: Ints, names: Sequence[str]) -> Groups:
 class Assignment:
     """Split of every sample as a number, and its fold or `NO_FOLD`, each a byte: shape (N,)."""
 
-    code: NDArray[np.uint8]
+    code: Bytes
     fold: NDArray[np.int8]
 
     @property

@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tcpipe.arrays import Floats, Mask
+from tcpipe.arrays import Floats, GenericArray, Mask
 from tcpipe.tables.facts import HeldOut
 
 Ints = NDArray[np.signedinteger]
@@ -105,7 +105,7 @@ def _audit_split(name: str, held: Ints, run: Ints, train: Footprints, neighbours
     )
 
 
-def compute_middles(ends: Sequence[NDArray[np.generic]]) -> Floats:
+def compute_middles(ends: Sequence[GenericArray]) -> Floats:
     """Return the middles of chords, shape (N, 2), by the columns `PLACES` [deg] or `LOCAL_PLACES` [m]."""
     x0, y0, x1, y1 = (end.astype(np.float64) for end in ends)
     return np.column_stack([(x0 + x1) / 2.0, (y0 + y1) / 2.0])

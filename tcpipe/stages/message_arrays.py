@@ -11,11 +11,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import AnyArray, Floats, Ints, Texts
 from tcpipe.fusion.measurements import GNSS, POSE
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.logs.extrinsics import Transforms
-from tcpipe.logs.field_mapping import Array
 from tcpipe.logs.messages import LOG_TIME
 from tcpipe.logs.topics import Topic
 from tcpipe.power.rails import Rail, make_rail, make_samples
@@ -23,7 +22,7 @@ from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_number
 from tcpipe.tables.levels import STREAMS, Streams
 
 T = TypeVar("T", bound=np.generic)
-Arrays = dict[str, Array]
+Arrays = dict[str, AnyArray]
 
 
 class LogReader(Protocol):
@@ -85,7 +84,7 @@ def _read_nested(lists: pa.Array, path: list[str]) -> Floats | None:
     )
 
 
-def _read_text_lists(lists: pa.Array) -> NDArray[np.str_] | None:
+def _read_text_lists(lists: pa.Array) -> Texts | None:
     """Return lists of texts, shape (N, k); None where they are no texts."""
     if not _is_list(lists.type) or not pa.types.is_string(lists.type.value_type):
         return None
@@ -167,7 +166,7 @@ def gather_messages(
     return {topic: _sort_columns(_join_columns(parts)) for topic, parts in pieces.items()}, joined
 
 
-def _compact_column(values: Array) -> Array:
+def _compact_column(values: AnyArray) -> AnyArray:
     """Return a copy of its own of a column's values; one row for all, where every row has the same bits."""
     values = np.ascontiguousarray(values)
     row_bytes = values[:1].nbytes
@@ -186,7 +185,7 @@ def _join_columns(parts: list[Arrays]) -> Arrays:
     return {name: _concatenate_column([part.pop(name) for part in parts]) for name in list(parts[0])}
 
 
-def _concatenate_column(pieces: list[Array]) -> Array:
+def _concatenate_column(pieces: list[AnyArray]) -> AnyArray:
     """Return pieces of one column as one; rows of lists that are shorter than the longest are filled up."""
     if len(pieces) == 1:
         return pieces[0]
@@ -203,7 +202,7 @@ def _concatenate_column(pieces: list[Array]) -> Array:
     return np.concatenate(pieces)
 
 
-def _is_constant(values: Array) -> bool:
+def _is_constant(values: AnyArray) -> bool:
     return len(values) == 1 or values.strides[0] == 0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, Floats, Ints
+from tcpipe.arrays import AnyInts, Bytes, Floats, Ints
 from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
 from tcpipe.recipe.suggestions import suggest
@@ -109,7 +109,7 @@ def sample_segments(
     )
 
 
-def place_segments(segments: pa.Table, place: Projection | NDArray[np.integer], config: SampleConfig) -> Sampled:
+def place_segments(segments: pa.Table, place: Projection | AnyInts, config: SampleConfig) -> Sampled:
     """Return the footprints of all segments, without patches.
 
     Parameters
@@ -155,7 +155,7 @@ _FRAME_STEP_M = 100.0
 """Step by which local frames are moved [m]: split blocks of 1, 2, 5, 10, 20, 25 or 50 m stay whole."""
 
 
-def separate_frames(frame: NDArray[np.integer], ends_xy_m: Sequence[Floats]) -> list[Floats]:
+def separate_frames(frame: AnyInts, ends_xy_m: Sequence[Floats]) -> list[Floats]:
     """Return points of local frames in one plane [m], each shape (N, 2): later frames begin farther along x.
 
     ``frame`` is the number of each point's frame, shape (N,).

@@ -9,19 +9,18 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import AnyArray, Floats, Ints, Texts
 from tcpipe.errors import TableError
 from tcpipe.tables.bits import flag_name
 
 
-def to_numbers(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
+def to_numbers(column: pa.Array | pa.ChunkedArray) -> AnyArray:
     """Return a numeric or Boolean column, shape (N,), possibly read-only; integers with nulls as float64, null: NaN."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if pa.types.is_boolean(array.type) and not array.null_count:
@@ -34,14 +33,14 @@ def to_numbers(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
     return np.from_dlpack(array)
 
 
-def to_texts(column: pa.Array | pa.ChunkedArray) -> NDArray[np.str_]:
+def to_texts(column: pa.Array | pa.ChunkedArray) -> Texts:
     """Return a column of texts, shape (N,)."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     encoded = array.dictionary_encode(null_encoding="encode")
     return np.asarray(np.array(encoded.dictionary.to_pylist(), np.str_)[to_numbers(encoded.indices)])
 
 
-def number_column(values: NDArray[Any], *, nan_is_null: bool = False) -> pa.Array:
+def number_column(values: AnyArray, *, nan_is_null: bool = False) -> pa.Array:
     """Return an Arrow array over numbers or truth values, shape (N,)."""
     if values.dtype == np.bool_:
         packed = np.packbits(values.view(np.uint8) != 0, bitorder="little")

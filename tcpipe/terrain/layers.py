@@ -24,7 +24,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, Floats, Floats32, Mask
+from tcpipe.arrays import AnyInts, Bytes, Floats, Floats32, Mask, Texts
 
 NODATA_ID = 0
 """The id of pixels without a class."""
@@ -59,7 +59,7 @@ class ClassTable:
         """Return the name of an id of the table."""
         return next(entry.name for entry in self.classes if entry.id == class_id)
 
-    def names(self) -> NDArray[np.str_]:
+    def names(self) -> Texts:
         """Return names by id, shape (256,); empty where the table has no such id."""
         names = [""] * (MAX_ID + 1)
         for entry in self.classes:
@@ -95,7 +95,7 @@ class ClassScheme:
     table: ClassTable
     id_by_value: Mapping[int, int]
 
-    def ids(self, values: NDArray[np.integer], valid: Mask) -> Bytes:
+    def ids(self, values: AnyInts, valid: Mask) -> Bytes:
         """Return class ids of raster values of any integer type and shape; 0 where not ``valid`` or not named."""
         known = np.array(sorted(self.id_by_value), np.int64)
         id_of = np.array([self.id_by_value[int(value)] for value in known], np.uint8)

@@ -17,12 +17,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, Floats, Ints, Mask
+from tcpipe.arrays import AnyArray, Bytes, Floats, Ints, Mask
 from tcpipe.errors import TableError
 from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M, STACKS, group_stacks
@@ -51,7 +50,7 @@ class Patches:
     and front edge above the smallest [m], NaN without data, (N, 3).
     """
 
-    pixels: Mapping[str, NDArray[Any]]
+    pixels: Mapping[str, AnyArray]
     height_min_m: Floats
     slope_rad: Floats
     cross_slope_rad: Floats
@@ -61,7 +60,7 @@ class Patches:
     terrain_purity: Floats
     profile_m: Floats
 
-    def columns(self) -> dict[str, NDArray[Any]]:
+    def columns(self) -> dict[str, AnyArray]:
         """Return all but the pixels, by name."""
         return {entry.name: getattr(self, entry.name) for entry in fields(self)[1:]}
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, Floats, Floats32, Ints, Mask
+from tcpipe.arrays import Bytes, Floats, Floats32, GenericArray, Ints, Mask
 from tcpipe.compiled import compile_kernel
 from tcpipe.terrain.layers import HEIGHT_NODATA
 
@@ -134,15 +134,13 @@ def sample_tiles(tiles: Tiles, ground: Ground, chosen: Ints, out: Stacks) -> Non
 
 
 @compile_kernel
-def _take_layer(stack: NDArray[np.generic], number: int, tiles: Tiles) -> NDArray[np.generic]:
+def _take_layer(stack: GenericArray, number: int, tiles: Tiles) -> GenericArray:
     """Return one of the layers of a kind, (S,)."""
     return stack[number * tiles.relative.size : (number + 1) * tiles.relative.size]
 
 
 @compile_kernel
-def _copy_window(
-    layer: NDArray[np.generic], tiles: Tiles, box: Ints, blank: np.generic, window: NDArray[np.generic]
-) -> None:
+def _copy_window(layer: GenericArray, tiles: Tiles, box: Ints, blank: np.generic, window: GenericArray) -> None:
     """Copy a box of a layer from one or more tiles, row by row; ground without a tile is blank."""
     slots, high, wide = tiles.slots, tiles.rows, tiles.cols
     for i in range(box[0] // high, (box[2] - 1) // high + 1):

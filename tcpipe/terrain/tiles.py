@@ -7,12 +7,12 @@ from collections import OrderedDict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import AnyArray, Floats, GenericArray, Ints
 from tcpipe.terrain.layers import STACKS, ClassTable, Layer, Stack, find_no_data_value, group_stacks
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 from tcpipe.terrain.resampling import choose_factor
@@ -52,7 +52,7 @@ class MapReader(ABC):
         """Return the map at one of its ``factors``."""
 
     @abstractmethod
-    def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
+    def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> AnyArray:
         """Return rows ``row0:row1`` and columns ``col0:col1`` of a layer.
 
         Height is in metres above `height_reference_m`; no data is NaN, or 0 in layers of bytes.
@@ -63,7 +63,7 @@ class MapReader(ABC):
         """Have tiles (row, column) of all layers at hand that are read soon, where that takes long."""
 
     @abstractmethod
-    def read_tile(self, layer: str, i: int, j: int, out: NDArray[np.generic]) -> None:
+    def read_tile(self, layer: str, i: int, j: int, out: GenericArray) -> None:
         """Copy the tile in row i and column j into ``out``, contiguous, `tile_px` each way; no data beyond the map."""
 
 
@@ -95,10 +95,10 @@ def group_by_tile(px: Floats, source: MapReader) -> Iterator[Ints]:
 
 def read_tile_window(  # noqa: PLR0917
     source: MapReader, layer: str, row0: int, row1: int, col0: int, col1: int
-) -> NDArray[Any]:
+) -> AnyArray:
     """Return a window of a layer that may reach beyond the map, where it has no data."""
     dtype, grid = source.layers[layer].mapped, source.grid
-    out: NDArray[Any] = np.full((row1 - row0, col1 - col0), find_no_data_value(dtype), dtype)
+    out: AnyArray = np.full((row1 - row0, col1 - col0), find_no_data_value(dtype), dtype)
     top, bottom, left, right = max(row0, 0), min(row1, grid.rows), max(col0, 0), min(col1, grid.cols)
     if top < bottom and left < right:
         out[top - row0 : bottom - row0, left - col0 : right - col0] = source.read(layer, top, bottom, left, right)
@@ -117,7 +117,7 @@ class TilePool:
         self.slots: NDArray[np.int32] = np.full((-(-grid.rows // side), -(-grid.cols // side)), -1, np.int32)
         """Which of the held tiles is the one in row i and column j; -1 where it is not held."""
         self._held: OrderedDict[tuple[int, int], int] = OrderedDict()
-        self._flat: dict[Stack, NDArray[Any]] = {
+        self._flat: dict[Stack, AnyArray] = {
             stack: np.empty((len(names), 0), STACKS[stack]) for stack, names in self._stacks.items()
         }
         self._grow(min(CACHED_TILES, self.slots.size))

@@ -14,13 +14,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import DTypeLike, NDArray
 
-from tcpipe.arrays import Ints, Mask
+from tcpipe.arrays import AnyArray, Ints, Mask
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import MAX_COLUMNS, MAX_TOPICS
 from tcpipe.formats.logs.log_part import gather_integers
@@ -64,7 +63,7 @@ class AutopilotMessages:
     time_us: Ints
     scales: Mapping[str, float]
 
-    def read_columns(self, data: bytes) -> dict[str, NDArray[Any]]:
+    def read_columns(self, data: bytes) -> dict[str, AnyArray]:
         """Return the fields by name, shape (N,) or (N, k)."""
         size = self.layout.itemsize
         packed: NDArray[np.void] = np.ndarray((len(data) - size + 1,), f"V{size}", data, 0, (1,))

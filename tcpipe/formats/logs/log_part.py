@@ -18,9 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import GenericArray, Ints
 from tcpipe.errors import LogError
 from tcpipe.formats.object_storage import StoredObject
 from tcpipe.logs.topics import Damage, Topic
@@ -368,5 +367,5 @@ def gather_integers(buffer: bytes | memoryview, offsets: Ints, code: str) -> Int
     sign bit, and one that claims to is negative, which every check refuses.
     """
     kind = np.dtype("<" + code)
-    windows: NDArray[np.generic] = np.ndarray((len(buffer) - kind.itemsize + 1,), kind, buffer, 0, (1,))
+    windows: GenericArray = np.ndarray((len(buffer) - kind.itemsize + 1,), kind, buffer, 0, (1,))
     return windows[offsets].astype(np.int64)

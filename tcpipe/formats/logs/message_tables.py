@@ -9,16 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import GenericArray, Ints
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import OpenLog, hash_files
 from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.tables.columns import make_text_column, number_column
 from tcpipe.tables.findings import Finding
 
-Fields = Mapping[str, "NDArray[np.generic] | pa.Array"]
+Fields = Mapping[str, "GenericArray | pa.Array"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +89,7 @@ def make_topic(
     return TopicMessages(topic, make, damage)
 
 
-def _make_column(values: NDArray[np.generic] | pa.Array) -> pa.Array:
+def _make_column(values: GenericArray | pa.Array) -> pa.Array:
     """Return a column of messages: rows of shape (N, k) become lists, bytes texts."""
     if isinstance(values, pa.Array):
         return values

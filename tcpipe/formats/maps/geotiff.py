@@ -33,7 +33,7 @@ from rasterio.features import rasterize
 from rasterio.io import MemoryFile
 from rasterio.windows import Window
 
-from tcpipe.arrays import Bytes, Floats, Mask
+from tcpipe.arrays import AnyArray, Bytes, Floats, Mask
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.maps.map_facts import read_value_names
@@ -160,7 +160,7 @@ def keep_open() -> Iterator[OpenFile]:
 
 def read_window(  # noqa: PLR0917
     open_file: OpenFile, tile: Tile, row0: int, row1: int, col0: int, col1: int, shape: tuple[int, int] | None = None
-) -> tuple[NDArray[Any], Mask]:
+) -> tuple[AnyArray, Mask]:
     """Return a window of a tile, and which of its pixels have data; `MapError`: they are damaged, or the file is gone.
 
     Values are float64 metres or numbers, float64 grey or colour from 0 to 255, or raw integers of classes. If the
@@ -187,7 +187,7 @@ def read_window(  # noqa: PLR0917
     return values, valid & np.isfinite(values)
 
 
-def _read_whole_numbers(tile: Tile, values: NDArray[Any], valid: Mask) -> NDArray[Any]:
+def _read_whole_numbers(tile: Tile, values: AnyArray, valid: Mask) -> AnyArray:
     """Return class values that are stored as floats; `MapError` for one that is no whole number."""
     whole = np.where(valid, values, 0.0)
     odd = whole[(whole != np.rint(whole)) | (np.abs(whole) > np.iinfo(tile.dtype).max)]
@@ -199,7 +199,7 @@ def _read_whole_numbers(tile: Tile, values: NDArray[Any], valid: Mask) -> NDArra
     return whole.astype(tile.dtype)
 
 
-def _read_grey(dataset: Any, tile: Tile, raw: NDArray[Any], weights_rgb: tuple[float, float, float]) -> Floats:
+def _read_grey(dataset: Any, tile: Tile, raw: AnyArray, weights_rgb: tuple[float, float, float]) -> Floats:
     if dataset.colorinterp[tile.bands[0] - 1] == ColorInterp.palette:
         return np.asarray(_read_palette_grey(dataset.colormap(tile.bands[0]), weights_rgb)[raw[0]])
     weights = np.array(weights_rgb if len(tile.bands) == 3 else (1.0,)) * tile.scale[0]
@@ -482,7 +482,7 @@ _STRIP_ROWS = 512
 
 def write_geotiff(
     path: Path,
-    strip: Callable[[int, int], NDArray[Any]],
+    strip: Callable[[int, int], AnyArray],
     grid: MapGrid,
     *,
     dtype: str,
@@ -536,7 +536,7 @@ def _read_again(path: Path) -> None:
 
 def write_cog(
     path: Path,
-    strip: Callable[[int, int], NDArray[Any]],
+    strip: Callable[[int, int], AnyArray],
     grid: MapGrid,
     *,
     dtype: str,
@@ -559,7 +559,7 @@ def write_cog(
             _read_again(temporary)
 
 
-def read_bands(path: Path, bands: Sequence[int]) -> NDArray[Any]:
+def read_bands(path: Path, bands: Sequence[int]) -> AnyArray:
     """Return bands, counted from 1, of a GeoTIFF from `write_cog`, shape (B, rows, cols). `MapError`: unreadable."""
     try:
         with keep_open() as open_file:

@@ -12,13 +12,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import AnyArray, Bytes, Floats, Ints, Mask
 from tcpipe.errors import MapError
 from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.maps.geotiff import COLOUR_USES, OpenFile, Tile, Use, read_tile, read_window
@@ -58,7 +56,7 @@ class Raster:
         """Its name without the folder."""
         return label_files([Path(tile.path.name) for tile in self.tiles])
 
-    def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], Mask]:
+    def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[AnyArray, Mask]:
         """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.read_window`."""
         low = np.maximum(self._corners[:, ::2], (row0, col0))
         high = np.minimum(self._corners[:, 1::2], (row1, col1))
@@ -439,7 +437,7 @@ _PICTURE_TAPS = 3
 """Least source pixels that are averaged, each way, for a pixel of a picture; of a finer raster some are left out."""
 
 
-def draw_colours(ortho: RasterLayer, side_px: int) -> NDArray[np.uint8] | None:
+def draw_colours(ortho: RasterLayer, side_px: int) -> Bytes | None:
     """Return an orthophoto of at most ``side_px`` in colour, shape (R, C, 3), no data in white; None of a grey one."""
     colours = split_colours(ortho.raster)
     if not colours:

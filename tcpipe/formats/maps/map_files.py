@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
 
+from tcpipe.arrays import AnyArray, Bytes
 from tcpipe.errors import MapError, StoreError
 from tcpipe.formats.integrity import read_checksums
 from tcpipe.formats.json_files import convert_record, parse_typed, read_json, to_plain
@@ -119,12 +120,12 @@ class MapFile(MapReader):
             described=_describe_layers(self.layers),
         )
 
-    def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
+    def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> AnyArray:
         """Return a window of a layer as stored."""
         with _name_damage(f"map {self.name}: {layer}, rows {row0} to {row1}, columns {col0} to {col1}"):
             return self._levels[self._factor][layer].window(row0, row1, col0, col1)
 
-    def read_picture(self) -> NDArray[np.uint8] | None:
+    def read_picture(self) -> Bytes | None:
         """Return the orthophoto in colour, shape (R, C, 3), at most `PICTURE_PX` a side; None without colours."""
         with _name_damage(f"map {self.name}: its picture"):
             return self._picture.chunk((0, 0, 0)) if self._picture else None
@@ -134,7 +135,7 @@ class MapFile(MapReader):
         for array in self._levels[self._factor].values():
             array.expect(tiles)
 
-    def read_tile(self, layer: str, i: int, j: int, out: NDArray[Any]) -> None:
+    def read_tile(self, layer: str, i: int, j: int, out: AnyArray) -> None:
         """Decode the tile in row i and column j into ``out``."""
         grid, side = self.grid, self.tile_px
         where = f"rows {i * side} to {(i + 1) * side}, columns {j * side} to {(j + 1) * side}"
@@ -287,7 +288,7 @@ class MapWriter:
         for factor, level in iterate_levels(self._layers[layer], values, self._factors):
             _put(self._levels[factor][layer], row0 // factor, col0 // factor, level)
 
-    def write_picture(self, colours: NDArray[np.uint8]) -> None:
+    def write_picture(self, colours: Bytes) -> None:
         """Write the orthophoto in colour, shape (R, C, 3), at most `PICTURE_PX` a side."""
         rows, cols, count = self._picture_shape = colours.shape
         dimensions = ("picture_y", "picture_x", "colour")

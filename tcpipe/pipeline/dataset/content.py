@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Texts
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import (
     LOCAL,
@@ -73,7 +73,7 @@ class SampleTable:
     has_terrain: bool
     assigned: Assignment
     map_names: tuple[str, ...]
-    class_names: NDArray[np.str_]
+    class_names: Texts
     patch: Ints
     flags: NDArray[np.uint32]
     """Quality bits of each patch of ``sampled`` beyond those of its segment."""

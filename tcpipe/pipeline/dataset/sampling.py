@@ -9,13 +9,12 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints
+from tcpipe.arrays import AnyArray, Ints
 from tcpipe.errors import TcpipeError
 from tcpipe.execution import run_all, unwrap_result
 from tcpipe.formats.dataset_files import LayerPixels
@@ -139,7 +138,7 @@ def sample_all_segments(
     # A batch is made when a worker can have it: one copy of its segments exists at a time.
     sample = partial(_sample_batch, maps=maps, config=config, gnss_crs=gnss_crs, shifts=shifts, spool=spool)
     lost_by, slots = (make_mapped_array(directory, (segments.num_rows,), kind) for kind in (np.uint32, np.int64))
-    counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
+    counts, columns = [0] * len(rows), dict[str, AnyArray]()
     findings: dict[int, tuple[Finding, ...]] = {}
     meter = Meter("sampling", segments.num_rows)
     try:
