@@ -247,7 +247,7 @@ def touches_voltage_outside(
     rails: list[Rail], start_ns: Ints, end_ns: Ints, *, range_volt: tuple[float, float] | None
 ) -> Mask:
     """Return the spans that touch a voltage sample outside the range [V], shape (M,); none without a range."""
-    outside = np.zeros(len(start_ns), dtype=np.bool_)
+    outside = np.zeros(len(start_ns), dtype=bool)
     low, high = range_volt or (-np.inf, np.inf)
     for voltage in (rail.voltage for rail in rails if not is_power_only(rail.voltage.value)):
         bad = np.concatenate(([0], np.cumsum((voltage.value < low) | (voltage.value > high))))

@@ -261,7 +261,7 @@ def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], idle_wat
 
 def _fit_non_negative(made: Floats, target: Floats) -> Floats:
     """Return what fits best with no size below zero: mostly no bound holds, and the plain solution is it."""
-    plain = np.asarray(np.linalg.lstsq(made, target, rcond=None)[0], np.float64)
+    plain = np.asarray(np.linalg.lstsq(made, target, rcond=None)[0], float)
     return plain if (plain >= 0.0).all() else nnls(made, target)[0]
 
 

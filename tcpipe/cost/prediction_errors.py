@@ -159,7 +159,7 @@ class QuantityErrors:
     ) -> tuple[Floats, Floats]:
         """Return the interval of each path segment, shape (N,) each."""
         spread, near = self.compute_std(predicted, class_id, stated, is_near), self.near or self
-        flags = np.zeros(len(predicted), np.bool_) if is_near is None else is_near
+        flags = np.zeros(len(predicted), bool) if is_near is None else is_near
         low, high = np.where(flags, near.low, self.low), np.where(flags, near.high, self.high)
         return predicted + low * spread, predicted + high * spread
 
@@ -244,7 +244,7 @@ def fit_errors(residuals: Residuals) -> dict[str, QuantityErrors] | None:
     away, by_runs = _fit_quantities(residuals, held), {name: residuals[name] for name in NEAR if name in residuals}
     if not by_runs:
         return away
-    rows = np.isfinite(by_runs[NEAR[1]].astype(np.float64))
+    rows = np.isfinite(by_runs[NEAR[1]].astype(float))
     close = {name: values[rows] for name, values in residuals.items() if name not in _STATED}
     close |= {name.replace("_near", ""): values[rows] for name, values in by_runs.items()}
     held_near = _Held.collect(close)
@@ -321,8 +321,8 @@ def _find_common_share(residuals: Residuals, name: str) -> float:
     """Return the standard deviation of the labels' common error as a share of their sum; 0 where it is not stated."""
     if not {_COMMON.get(name, name), "duration_s"} <= residuals.keys():
         return 0.0
-    std, label = residuals[_COMMON[name]].astype(np.float64), residuals["duration_s"].astype(np.float64)
-    label = label if name == "duration" else np.abs(residuals["power_watt"].astype(np.float64) * label)
+    std, label = residuals[_COMMON[name]].astype(float), residuals["duration_s"].astype(float)
+    label = label if name == "duration" else np.abs(residuals["power_watt"].astype(float) * label)
     known = np.isfinite(std + label)
     return float(std[known].sum() / label[known].sum()) if label[known].any() else 0.0
 
@@ -353,7 +353,7 @@ class _Held:
             return None
         nothing = np.zeros(len(residuals["velocity_mps"]))
         power, velocity, predicted_power, predicted_velocity = (
-            residuals.get(name, nothing).astype(np.float64) for name in names
+            residuals.get(name, nothing).astype(float) for name in names
         )
         usable = np.isfinite(power + predicted_power) & (velocity > 0.0) & (predicted_velocity > 0.0)
         if np.count_nonzero(usable) < FEWEST:
@@ -370,12 +370,12 @@ class _Held:
             {"power": p[rows], "velocity": v[rows], "duration": 1.0 / v[rows], "energy": p[rows] / v[rows]}
             for p, v in ((power, velocity), (predicted_power, predicted_velocity))
         )
-        class_id = np.nan_to_num(residuals["terrain_class"][rows].astype(np.float64)).astype(np.int64)
+        class_id = np.nan_to_num(residuals["terrain_class"][rows].astype(float)).astype(np.int64)
         fold = residuals["fold"][rows].astype(np.int64) if "fold" in residuals else np.zeros(rows.size, np.int64)
         is_one_fold = "fold" in residuals and np.unique(fold).size == 1
         covariance = np.zeros((rows.size, 2, 2))
         if _STATED[1] in residuals:
-            of_power, of_velocity, both = (residuals.get(name, nothing)[rows].astype(np.float64) for name in _STATED)
+            of_power, of_velocity, both = (residuals.get(name, nothing)[rows].astype(float) for name in _STATED)
             covariance = np.array([[of_power**2, both], [both, of_velocity**2]]).transpose(2, 0, 1)
         mean = np.column_stack([predicted["power"], predicted["velocity"]])
         stated = propagate_stated(mean, covariance)
@@ -490,7 +490,7 @@ def _estimate_correlation(standard: Floats, held: _Held) -> tuple[Floats, Floats
     for edge, start in zip(_LAGS_M[1:].tolist(), np.searchsorted(far_m, _LAGS_M[1:]).tolist(), strict=True):
         if start - starts[-1] >= _FEWEST_PAIRS and far_m.size - start >= far_pairs:
             edges, starts = [*edges, edge], [*starts, start]
-    pairs = np.diff([*starts, far_m.size]).astype(np.float64)
+    pairs = np.diff([*starts, far_m.size]).astype(float)
     if not far_m.size:
         return np.zeros(1), np.zeros(1)
     rho = np.add.reduceat(products, starts) / pairs / max(float(np.mean(standard**2)), 1e-12)

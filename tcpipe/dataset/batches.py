@@ -217,7 +217,7 @@ class Batches:
             yield pool, np.arange(len(left)), left
 
     def _batch(self, pixels: Pixels, rows: Ints, samples: Ints, mirrors: np.random.Generator) -> Batch:
-        mirrored = mirrors.random(len(rows)) < 0.5 if self.mirror else np.zeros(len(rows), np.bool_)
+        mirrored = mirrors.random(len(rows)) < 0.5 if self.mirror else np.zeros(len(rows), bool)
         patches = self.view.form.form(pixels, rows, mirrored)
         inputs = (patches, _compute_features(self.features, samples, mirrored)) if self.features else patches
         batch = (inputs, self.labels[samples])

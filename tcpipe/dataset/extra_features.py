@@ -53,9 +53,9 @@ COLUMNS = ("mean_abs_yaw_rate_radps", "duration_s", "arc_length_m", "commanded_v
 
 def read_extra_features(split: Split) -> ExtraFeatures:
     """Return the extra features of a split; columns that an older dataset lacks are NaN."""
-    turn, command = _form_values(split.column(name).astype(np.float64) for name in COLUMNS)
-    class_id = np.nan_to_num(split.column("terrain_class").astype(np.float64), nan=0.0).astype(np.int64)
-    return ExtraFeatures(class_id, split.column("slope_rad").astype(np.float64), turn, command)
+    turn, command = _form_values(split.column(name).astype(float) for name in COLUMNS)
+    class_id = np.nan_to_num(split.column("terrain_class").astype(float), nan=0.0).astype(np.int64)
+    return ExtraFeatures(class_id, split.column("slope_rad").astype(float), turn, command)
 
 
 def empty_extra_features(count: int) -> ExtraFeatures:
@@ -108,6 +108,6 @@ def append_planes(patches: Floats32, numbers: Floats) -> Floats32:
 
 def append_column_planes(inputs: Sequence[ExtraFeature], patches: Floats32, columns: NDArray[np.floating]) -> Floats32:
     """Return patches of a batch with a plane for each extra feature, from `COLUMNS` of the batch, shape (N, 4)."""
-    turn, command = _form_values(columns.T.astype(np.float64))
+    turn, command = _form_values(columns.T.astype(float))
     features = replace(empty_extra_features(len(columns)), turn_radpm=turn, command_mps=command)
     return append_planes(patches, standardize_features(inputs, features))

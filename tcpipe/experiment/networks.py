@@ -40,7 +40,7 @@ class EnergySamples(Samples):
     @cached_property
     def labels(self) -> Floats:
         """Energy [J], shape (N, 1)."""
-        return self.split.column(self.inputs.outputs[0]).astype(np.float64)[:, None]
+        return self.split.column(self.inputs.outputs[0]).astype(float)[:, None]
 
 
 class EnergyNetwork(NetworkModel):

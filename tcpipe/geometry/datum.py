@@ -34,7 +34,7 @@ def ecef_from_geodetic(lon_deg: ArrayLike, lat_deg: ArrayLike, alt_m: ArrayLike)
     -------
     [m], shape (..., 3).
     """
-    lon, lat, alt = np.radians(lon_deg), np.radians(lat_deg), np.asarray(alt_m, np.float64)
+    lon, lat, alt = np.radians(lon_deg), np.radians(lat_deg), np.asarray(alt_m, float)
     prime_vertical_m = SEMI_MAJOR_AXIS_M / np.sqrt(1 - _E2 * np.sin(lat) ** 2)
     across_m = (prime_vertical_m + alt) * np.cos(lat)
     return np.stack(
@@ -49,7 +49,7 @@ def geodetic_from_ecef(ecef_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
     ----------
     ecef_m : [m], shape (..., 3), not nearer than 100 km to the earth's centre.
     """
-    x, y, z = np.moveaxis(np.asarray(ecef_m, np.float64), -1, 0)
+    x, y, z = np.moveaxis(np.asarray(ecef_m, float), -1, 0)
     across_m = np.hypot(x, y)
     reduced = np.arctan2(SEMI_MAJOR_AXIS_M * z, _SEMI_MINOR_AXIS_M * across_m)
     for _ in range(3):  # one suffices near the ground (1e-11 rad); three reach rounding at any height
@@ -91,4 +91,4 @@ def enu_from_geodetic(
 def geodetic_from_enu(enu_m: ArrayLike, *, datum_deg_m: tuple[float, float, float]) -> tuple[Floats, Floats, Floats]:
     """Return longitude, latitude [deg] and ellipsoidal height [m] of points (..., 3) in a datum's frame [m]."""
     rotation = ecef_from_enu_rotation(datum_deg_m[0], datum_deg_m[1])
-    return geodetic_from_ecef(np.asarray(enu_m, np.float64) @ rotation.T + ecef_from_geodetic(*datum_deg_m))
+    return geodetic_from_ecef(np.asarray(enu_m, float) @ rotation.T + ecef_from_geodetic(*datum_deg_m))

@@ -28,7 +28,7 @@ def wrap_to_pi(angle_rad: ArrayLike) -> Floats:
     -------
     [rad], the same shape; what is not finite stays so.
     """
-    angle = np.asarray(angle_rad, np.float64)
+    angle = np.asarray(angle_rad, float)
     wrapped = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
     # Rounding may land on +pi itself, or a hair below -pi.
     return np.maximum(np.where(wrapped >= np.pi, -np.pi, wrapped), -np.pi)
@@ -36,7 +36,7 @@ def wrap_to_pi(angle_rad: ArrayLike) -> Floats:
 
 def normalize(quat_xyzw: ArrayLike) -> Floats:
     """Return quaternions of unit length with w >= 0; NaN where the length is zero or not finite. Shape (..., 4)."""
-    quat = np.asarray(quat_xyzw, np.float64)
+    quat = np.asarray(quat_xyzw, float)
     length = np.linalg.norm(quat, axis=-1, keepdims=True)
     usable = np.isfinite(length) & (length > 1e-9)
     unit = np.where(usable, quat, np.nan) / np.where(usable, length, 1.0)
@@ -45,7 +45,7 @@ def normalize(quat_xyzw: ArrayLike) -> Floats:
 
 def matrix_from_quat(quat_xyzw: ArrayLike) -> Floats:
     """Return the rotation matrix (..., 3, 3) of unit quaternions (..., 4). Solà eq. 115."""
-    x, y, z, w = np.moveaxis(np.asarray(quat_xyzw, np.float64), -1, 0)
+    x, y, z, w = np.moveaxis(np.asarray(quat_xyzw, float), -1, 0)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
         (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
@@ -56,7 +56,7 @@ def matrix_from_quat(quat_xyzw: ArrayLike) -> Floats:
 
 def quat_from_matrix(rotation: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3); divides by the largest component."""
-    R = np.asarray(rotation, np.float64)
+    R = np.asarray(rotation, float)
     trace = np.trace(R, axis1=-2, axis2=-1)
     # Each row is the quaternion times four times one of its own components.
     candidates = np.empty((*R.shape[:-2], 4, 4))
@@ -71,7 +71,7 @@ def quat_from_matrix(rotation: ArrayLike) -> Floats:
 
 def quat_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) -> Floats:
     """Return unit quaternions (..., 4) of fixed-axis roll, pitch, yaw [rad]."""
-    r, p, y = np.broadcast_arrays(*(np.asarray(a, np.float64) / 2 for a in (roll_rad, pitch_rad, yaw_rad)))
+    r, p, y = np.broadcast_arrays(*(np.asarray(a, float) / 2 for a in (roll_rad, pitch_rad, yaw_rad)))
     sr, cr, sp, cp, sy, cy = np.sin(r), np.cos(r), np.sin(p), np.cos(p), np.sin(y), np.cos(y)
     return normalize(
         np.stack(
@@ -88,7 +88,7 @@ def quat_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike)
 
 def rpy_from_matrix(rotation: ArrayLike) -> Floats:
     """Return roll, pitch, yaw [rad] (..., 3), [-pi, pi), pitch in [-pi/2, pi/2], of rotation matrices (..., 3, 3)."""
-    R = np.asarray(rotation, np.float64)
+    R = np.asarray(rotation, float)
     pitch = np.arcsin(np.clip(-R[..., 2, 0], -1.0, 1.0))
     rpy = np.stack((np.arctan2(R[..., 2, 1], R[..., 2, 2]), pitch, np.arctan2(R[..., 1, 0], R[..., 0, 0])), -1)
     return np.where(rpy >= np.pi, -np.pi, rpy)
@@ -101,8 +101,8 @@ def rpy_from_quat(quat_xyzw: ArrayLike) -> Floats:
 
 def multiply(a_from_b_xyzw: ArrayLike, b_from_c_xyzw: ArrayLike) -> Floats:
     """Return a_from_c (..., 4), w >= 0: the quaternion product. Solà eq. 12."""
-    x1, y1, z1, w1 = np.moveaxis(np.asarray(a_from_b_xyzw, np.float64), -1, 0)
-    x2, y2, z2, w2 = np.moveaxis(np.asarray(b_from_c_xyzw, np.float64), -1, 0)
+    x1, y1, z1, w1 = np.moveaxis(np.asarray(a_from_b_xyzw, float), -1, 0)
+    x2, y2, z2, w2 = np.moveaxis(np.asarray(b_from_c_xyzw, float), -1, 0)
     return normalize(
         np.stack(
             (
@@ -118,7 +118,7 @@ def multiply(a_from_b_xyzw: ArrayLike, b_from_c_xyzw: ArrayLike) -> Floats:
 
 def invert(a_from_b_xyzw: ArrayLike) -> Floats:
     """Return b_from_a (..., 4) of unit quaternions: the conjugate."""
-    return np.asarray(np.asarray(a_from_b_xyzw, np.float64) * np.array([-1.0, -1.0, -1.0, 1.0]))
+    return np.asarray(np.asarray(a_from_b_xyzw, float) * np.array([-1.0, -1.0, -1.0, 1.0]))
 
 
 def rotate(a_from_b_xyzw: ArrayLike, vector: ArrayLike) -> Floats:
@@ -128,7 +128,7 @@ def rotate(a_from_b_xyzw: ArrayLike, vector: ArrayLike) -> Floats:
 
 def quat_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Floats:
     """Return the exponential: unit quaternions (..., 4) of rotation vectors [rad] (..., 3). Solà eq. 101."""
-    vector = np.asarray(rotation_vector_rad, np.float64)
+    vector = np.asarray(rotation_vector_rad, float)
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     half_sinc = 0.5 * np.sinc(angle / (2 * np.pi))
     return normalize(np.concatenate((half_sinc * vector, np.cos(angle / 2)), -1))

@@ -126,11 +126,11 @@ def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "block
     if len(np.unique(runs)) >= FEWEST_GROUPS:
         return "runs", runs
     if split.has_coordinates:
-        lon_deg, lat_deg = (split.column(f"start_{axis}_deg").astype(np.float64) for axis in ("lon", "lat"))
+        lon_deg, lat_deg = (split.column(f"start_{axis}_deg").astype(float) for axis in ("lon", "lat"))
         datum = float(lon_deg[0]), float(lat_deg[0]), 0.0  # one for all: x and y of a sample are in its own run's frame
         xy_m = enu_from_geodetic(lon_deg, lat_deg, 0.0, datum_deg_m=datum)[:, :2]
     else:
-        xy_m = np.column_stack([split.column(f"start_{axis}_m").astype(np.float64) for axis in "xy"])
+        xy_m = np.column_stack([split.column(f"start_{axis}_m").astype(float) for axis in "xy"])
     return "blocks", np.unique(np.floor(xy_m / block_m), axis=0, return_inverse=True)[1].reshape(-1)
 
 

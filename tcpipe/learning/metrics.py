@@ -71,7 +71,7 @@ class Spread:
 
 def compute_errors(predicted: Floats, measured: Floats, least: float = 0.0, spread: Spread | None = None) -> Errors:
     """Return the errors of predictions, both of shape (N,), and their scores where a spread is stated."""
-    difference = np.asarray(predicted, np.float64) - measured
+    difference = np.asarray(predicted, float) - measured
     large = measured >= least
     rmse = float(np.sqrt(np.mean(difference**2))) if len(difference) else None
     mape = 100.0 * float(np.mean(np.abs(difference[large]) / measured[large])) if large.any() else None
@@ -139,7 +139,7 @@ def compute_errors_by_class(
 
 def _group_by_class(compute: Callable[[Mask], Errors], class_ids: Ints, names: Mapping[int, str]) -> dict[str, Errors]:
     """Return what is computed of rows, by the name of each class that occurs, and of `ALL`."""
-    rows = {name: class_ids == class_id for class_id, name in names.items()} | {ALL: np.ones(len(class_ids), np.bool_)}
+    rows = {name: class_ids == class_id for class_id, name in names.items()} | {ALL: np.ones(len(class_ids), bool)}
     return {name: compute(here) for name, here in rows.items() if here.any() or name == ALL}
 
 
@@ -180,7 +180,7 @@ def compute_path_error(predicted: Floats, measured: Floats, runs: GenericArray, 
 
 def compute_costs(power_watt: Floats, velocity_mps: Floats, chord_m: float) -> dict[str, Floats]:
     """Return w, v, T = d / v and E = w d / v."""
-    w, v = np.asarray(power_watt, np.float64), np.asarray(velocity_mps, np.float64)
+    w, v = np.asarray(power_watt, float), np.asarray(velocity_mps, float)
     return {"w": w, "v": v, "T": chord_m / v, "E": w * chord_m / v}
 
 

@@ -175,7 +175,7 @@ def load_model(path: Location, predictor: str | None = None) -> Model:
     table = read_table(place / RESIDUALS)
     residuals = {name: table.column(name).to_numpy() for name in table.column_names}
     if "terrain_class" in residuals:  # of a map without classes: null
-        residuals["terrain_class"] = np.nan_to_num(residuals["terrain_class"].astype(np.float64)).astype(np.uint8)
+        residuals["terrain_class"] = np.nan_to_num(residuals["terrain_class"].astype(float)).astype(np.uint8)
     ground = read_table(place / GROUND)
     ground_deg = np.column_stack([ground.column(name).to_numpy() for name in GROUND_COLUMNS])
     checksum = digest(seal_document(card))  # which is of its files, too

@@ -123,7 +123,7 @@ def compute_idle_power(split: Split) -> float | None:
     """Return the idle power contained in a split's power labels [W]; None if no run of it was stationary."""
     if split.energy is not ENERGIES["total"]:
         return 0.0
-    watt = split.column("idle_power_watt").astype(np.float64)
+    watt = split.column("idle_power_watt").astype(float)
     return float(np.nanmean(watt)) if np.isfinite(watt).any() else None
 
 
@@ -244,7 +244,7 @@ def fit_curves(slope_rad: Floats, class_id: Ints, labels: Floats, *, quantiles: 
     """
     knots = np.unique(np.quantile(slope_rad, quantiles)) if quantiles else np.empty(0)
     made = _evaluate_functions(knots, slope_rad)
-    pooled = np.asarray(np.linalg.lstsq(made, labels, rcond=None)[0], np.float64)
+    pooled = np.asarray(np.linalg.lstsq(made, labels, rcond=None)[0], float)
     drawn = made.T @ made * (made.shape[1] / len(made))
     classes = np.unique(class_id[class_id > 0])
     own = np.empty((len(classes), *pooled.shape))

@@ -49,17 +49,17 @@ def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
     columns = {"v": (velocity_column, "velocity_std_mps"), "T": ("duration_s", "duration_std_s")}
     if power_column:
         columns = {"w": (energy.power, energy.power_std), **columns, "E": (energy.energy, energy.energy_std)}
-    has_costs = [np.isfinite(split.column(name).astype(np.float64)) for name, _ in columns.values()]
+    has_costs = [np.isfinite(split.column(name).astype(float)) for name, _ in columns.values()]
     with_label = np.isfinite(split.labels).all(axis=1) & np.all(has_costs, axis=0)
     chosen = split.take(with_label)
-    deviations = {cost: chosen.column(std).astype(np.float64) for cost, (_, std) in columns.items()}
+    deviations = {cost: chosen.column(std).astype(float) for cost, (_, std) in columns.items()}
     own_deviations = {cost: chosen.own_std(std) for cost, (_, std) in columns.items()}
-    labels = dict(zip(split.label_columns, chosen.labels.T.astype(np.float64), strict=True))
-    class_ids = np.nan_to_num(chosen.column("terrain_class").astype(np.float64), nan=_UNKNOWN[0]).astype(np.int64)
+    labels = dict(zip(split.label_columns, chosen.labels.T.astype(float), strict=True))
+    class_ids = np.nan_to_num(chosen.column("terrain_class").astype(float), nan=_UNKNOWN[0]).astype(np.int64)
     known = dict([_UNKNOWN, *names.items()])
     return Measured(
         chosen,
-        {cost: labels.get(name, chosen.column(name).astype(np.float64)) for cost, (name, _) in columns.items()},
+        {cost: labels.get(name, chosen.column(name).astype(float)) for cost, (name, _) in columns.items()},
         deviations,
         own_deviations,
         class_ids,
@@ -193,7 +193,7 @@ def make_predictions_table(
             "split": [name] * len(found.split),
             "terrain_class": found.class_ids.astype(np.uint8),
             "terrain_name": [found.names[number] for number in found.class_ids.tolist()],
-            "slope_rad": found.split.column("slope_rad").astype(np.float64),
+            "slope_rad": found.split.column("slope_rad").astype(float),
         }
         values = {
             make_column_name(q, part): columns

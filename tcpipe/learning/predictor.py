@@ -84,7 +84,7 @@ class Prediction:
     @classmethod
     def without_covariance(cls, mean: Labels) -> Prediction:
         """Return a prediction of a model that states no covariances."""
-        return cls(np.asarray(mean, np.float64), np.zeros((*mean.shape, mean.shape[-1])))
+        return cls(np.asarray(mean, float), np.zeros((*mean.shape, mean.shape[-1])))
 
     @classmethod
     def concatenate(cls, parts: Sequence[Prediction]) -> Prediction:
@@ -134,7 +134,7 @@ class Samples:
     @cached_property
     def labels(self) -> Floats:
         """Labels, shape (N, outputs)."""
-        return self.split.labels.astype(np.float64)
+        return self.split.labels.astype(float)
 
     @property
     def folds(self) -> GenericArray:
@@ -268,14 +268,14 @@ def ask_predictor(
     name = type(predictor).__name__
     who = name if name == "predict" else f"{name}.predict"
     is_pair = isinstance(said, tuple) and len(said) == 2
-    mean: Floats = np.array(said[0] if is_pair else said, np.float64)
+    mean: Floats = np.array(said[0] if is_pair else said, float)
     if mean.shape != (len(patches), count):
         raise ModelError(
             f"{who} returned shape {mean.shape}, expected {(len(patches), count)}: {named} of {len(patches)} patches"
         )
     if not is_pair:
         return Prediction.without_covariance(mean)
-    covariance: Floats = np.array(said[1], np.float64)
+    covariance: Floats = np.array(said[1], float)
     if covariance.shape != (*mean.shape, count):
         raise ModelError(
             f"{who} returned covariances of shape {covariance.shape}, expected {(*mean.shape, count)}: those of {named}"

@@ -65,7 +65,7 @@ def compute_patch_features(patches: Patches, *, channels: Sequence[str], class_c
         else:
             texture = np.abs(np.diff(values, axis=2)).mean(axis=(1, 2))
             parts.append(np.column_stack([values.mean(axis=(1, 2)), values.std(axis=(1, 2)), texture]))
-    return np.column_stack(parts).astype(np.float64)
+    return np.column_stack(parts).astype(float)
 
 
 def find_slope_and_class(features: Floats, channels: Sequence[str], class_count: int) -> tuple[Floats, Ints]:
@@ -148,7 +148,7 @@ def clean_trees(text: str, features: int) -> str:
         leaves, (split, threshold, decision, left, right, value) = int(match[1]), match.groups()[1:]
         try:
             feature, children = np.array(split.split(), np.int64), np.array([left.split(), right.split()], np.int64)
-            limits, values = (np.array(numbers.split(), np.float64) for numbers in (threshold, value))
+            limits, values = (np.array(numbers.split(), float) for numbers in (threshold, value))
         except (ValueError, OverflowError):
             raise ModelError("contains trees with numbers that cannot be read; train the model again") from None
         nodes = np.arange(leaves - 1)

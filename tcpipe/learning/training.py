@@ -305,7 +305,7 @@ def find_training_range(split: Split) -> TrainingRange:
     ranges = {name: (float(np.min(slope)), float(np.max(slope))) for name, slope in slopes.items()}
     if reliefs_m:
         ranges["relief_m"] = (min(reliefs_m), max(reliefs_m))
-    class_ids = split.column("terrain_class").astype(np.float64)
+    class_ids = split.column("terrain_class").astype(float)
     ids, counts = np.unique(class_ids[np.isfinite(class_ids)].astype(int), return_counts=True)
     class_counts = dict(zip(ids.tolist(), counts.tolist(), strict=True))
     own = {name: LayerRange.estimate(np.concatenate(parts)) for name, parts in sorted(means.items())}

@@ -46,9 +46,7 @@ class Autopilot:
         row = np.searchsorted(time_us, at_us, side="right") - 1
         stale = (row < 0) | (at_us - time_us[row] > within_us)
         return {
-            name: np.where(stale, np.nan, field[row].astype(np.float64))
-            for name, field in fields.items()
-            if field.ndim == 1
+            name: np.where(stale, np.nan, field[row].astype(float)) for name, field in fields.items() if field.ndim == 1
         }
 
 
@@ -173,9 +171,9 @@ def _find_quality(kind: Ints) -> Floats:
 def _turn_axes(name: str, forward: Floats, right: Floats, down: Floats) -> dict[str, Floats]:
     """Return a vector's components forward, left and up."""
     return {
-        f"{name}_x": forward.astype(np.float64),
-        f"{name}_y": -right.astype(np.float64),
-        f"{name}_z": -down.astype(np.float64),
+        f"{name}_x": forward.astype(float),
+        f"{name}_y": -right.astype(float),
+        f"{name}_z": -down.astype(float),
     }
 
 
@@ -270,7 +268,7 @@ def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Ints, f: Colu
     speed, right_m = list[Floats](), list[float]()
     for distance_m, prefix in ((f["Dist0"], "WENC"), (f["Dist1"], "WENC2")):
         if log.parameters.get(f"{prefix}_TYPE", np.ptp(distance_m)):
-            speed.append(np.diff(distance_m.astype(np.float64), prepend=np.nan) / step_s)
+            speed.append(np.diff(distance_m.astype(float), prepend=np.nan) / step_s)
             right_m.append(log.parameters.get(f"{prefix}_POS_Y", 0.0))
     if not speed or (len(speed) == 1 and right_m != [0.0]):
         raise KeyError("a second wheel")

@@ -437,7 +437,7 @@ def _compute_repeated_share(times: TopicTimes) -> float:
         return 0.0
     again = np.diff(times.header_ns) == 0
     rows = np.flatnonzero(again)
-    other = [column[rows + 1].astype(np.float64) - column[rows] != 0 for column in times.content]
+    other = [column[rows + 1].astype(float) - column[rows] != 0 for column in times.content]
     again[rows] = np.any(other, axis=0)
     return float(np.mean(again))
 

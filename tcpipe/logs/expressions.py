@@ -97,7 +97,7 @@ class Expression:
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 return -self._evaluate(operand, read)
             case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
-                return np.asarray(value, np.float64)
+                return np.asarray(value, float)
             case ast.Subscript(value=value, slice=ast.Constant(value=int(index))):
                 return read(self._join_name(value), index)
         return read(self._join_name(node), None)

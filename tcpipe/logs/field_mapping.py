@@ -347,7 +347,7 @@ def _find_misfit(values: AnyArray, name: str, index: int | None, *, may_be_text:
 
 def _read_column(columns: Columns, name: str, index: int | None) -> Floats:
     values = columns[name] if index is None else columns[name][:, index]
-    return values.astype(np.float64) if np.issubdtype(values.dtype, np.number) else values
+    return values.astype(float) if np.issubdtype(values.dtype, np.number) else values
 
 
 def _match_axes(before: str, name: str) -> dict[str, str]:

@@ -102,9 +102,7 @@ def convert_gps_fix(columns: Columns) -> dict[str, AnyArray]:
     made = {**columns, "fix_quality": quality}
     made["status.status"] = np.where(quality >= 0, find_status(quality), np.clip(columns["status.status"], -1, 2))
     if "err_horz" in columns and not np.any(columns["position_covariance_type"]):
-        std_m = np.column_stack(
-            [columns[name].astype(np.float64) / 2.0 for name in ("err_horz", "err_horz", "err_vert")]
-        )
+        std_m = np.column_stack([columns[name].astype(float) / 2.0 for name in ("err_horz", "err_horz", "err_vert")])
         made["position_covariance"] = np.zeros((len(quality), 9))
         made["position_covariance"][:, ::4] = std_m**2
         made["position_covariance_type"] = np.where((std_m > 0).all(1), 2, 0)

@@ -142,7 +142,7 @@ def _select_rows(columns: Columns, values: dict[str, AnyArray], drops: Mapping[s
 
 def _read_vector(columns: Columns, prefix: str) -> Floats:
     """Return fields x, y, z as shape (N, 3)."""
-    return np.stack([columns[f"{prefix}.{axis}"].astype(np.float64) for axis in "xyz"], -1)
+    return np.stack([columns[f"{prefix}.{axis}"].astype(float) for axis in "xyz"], -1)
 
 
 def _name_axes(name: str, suffix: str, values: Floats) -> dict[str, AnyArray]:
@@ -153,7 +153,7 @@ def _read_variances(columns: Columns, name: str, *diagonal: int) -> Floats:
     """Return diagonal entries of a covariance, shape (N, k); NaN for unusable ones: zero, negative or not finite."""
     if name not in columns:
         return np.full((len(columns[LOG_TIME]), len(diagonal)), np.nan)
-    chosen = columns[name].astype(np.float64)[:, list(diagonal)]
+    chosen = columns[name].astype(float)[:, list(diagonal)]
     return np.where(np.isfinite(chosen) & (chosen > 0), chosen, np.nan)
 
 
@@ -188,7 +188,7 @@ _FEWEST_ZEROS = 20
 
 def _read_orientation(columns: Columns, prefix: str) -> tuple[Floats, Mask]:
     """Return unit quaternions (N, 4), NaN for other values, and the rows of these."""
-    given = np.stack([columns[f"{prefix}.{c}"].astype(np.float64) for c in "xyzw"], -1)
+    given = np.stack([columns[f"{prefix}.{c}"].astype(float) for c in "xyzw"], -1)
     length = np.linalg.norm(given, axis=-1)
     bad = ~(np.abs(length - 1.0) < _QUAT_TOLERANCE)
     return normalize(np.where(bad[:, None], np.nan, given)), bad
@@ -213,7 +213,7 @@ def _read_gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, quality
 
 
 def _read_nav_sat_fix(columns: Columns) -> Readings:
-    lat, lon, alt = (columns[name].astype(np.float64) for name in ("latitude", "longitude", "altitude"))
+    lat, lon, alt = (columns[name].astype(float) for name in ("latitude", "longitude", "altitude"))
     variances = _read_variances(columns, "position_covariance", 0, 4, 8)
     unknown = columns["position_covariance_type"] == 0
     variances[unknown] = np.nan
@@ -357,10 +357,10 @@ _BESIDE_NS = 500_000_000
 
 def _read_gps_fix(columns: Columns) -> Readings:
     speed, climb, err_speed, err_climb, err_track = (
-        columns[name].astype(np.float64) if name in columns else np.full(len(columns[LOG_TIME]), np.nan)
+        columns[name].astype(float) if name in columns else np.full(len(columns[LOG_TIME]), np.nan)
         for name in ("speed", "climb", "err_speed", "err_climb", "err_track")
     )
-    course = np.radians(columns["track"].astype(np.float64))
+    course = np.radians(columns["track"].astype(float))
     std = np.fmax(
         np.where(err_speed > 0, err_speed, np.nan), np.where(err_track > 0, speed * np.radians(err_track), np.nan)
     )
@@ -476,7 +476,7 @@ def _read_twist_stamped(columns: Columns) -> Readings:
 
 def _read_command(columns: Columns) -> Readings:
     prefix = "twist." if "twist.linear.x" in columns else ""
-    forward, yaw_rate = (columns[f"{prefix}{name}"].astype(np.float64) for name in ("linear.x", "angular.z"))
+    forward, yaw_rate = (columns[f"{prefix}{name}"].astype(float) for name in ("linear.x", "angular.z"))
     values: dict[str, AnyArray] = {"forward_velocity_mps": forward, "yaw_rate_radps": yaw_rate}
     return _select_rows(columns, values, {"not_finite": ~np.isfinite(forward + yaw_rate)})
 

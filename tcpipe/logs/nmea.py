@@ -85,7 +85,7 @@ def _read(
     """Return the places of sentences of a kind, which are damaged, and ``parse`` of their fields, shape (width, N)."""
     found = [(row, match) for row, text in enumerate(sentences) if (match := _SENTENCES[kind].search(text)) is not None]
     values = np.full((len(found), width), np.nan)
-    broken = np.zeros(len(found), np.bool_)
+    broken = np.zeros(len(found), bool)
     for at, (_, match) in enumerate(found):
         try:
             values[at] = parse(_split_fields(*match.groups()))

@@ -264,7 +264,7 @@ def walk(message: Record, data: Bytes, starts: Ints, ends: Ints, dialect: Dialec
 
     Each begins and ends in ``data`` at ``starts`` and ``ends``, shape (N,), rising.
     """
-    fits = np.ones(len(starts), np.bool_)
+    fits = np.ones(len(starts), bool)
     while fits.any():
         bases, sizes = starts[fits] + dialect.origin, ends[fits] - starts[fits] - dialect.origin
         cursors = _Cursors(data, _find_grid(bases, sizes), sizes, dialect)
@@ -276,7 +276,7 @@ def walk(message: Record, data: Bytes, starts: Ints, ends: Ints, dialect: Dialec
         if good.all():
             return WalkResult(root, fits)
         fits[fits] = good
-    return WalkResult(None, np.zeros(len(starts), np.bool_))
+    return WalkResult(None, np.zeros(len(starts), bool))
 
 
 def _find_grid(bases: Ints, sizes: Ints) -> Places:

@@ -78,7 +78,7 @@ def find_ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, abo
     """
     speeding_up = np.sign(rows.velocity_mps) * acceleration_mps2
     halts = np.concatenate(([0], np.cumsum(halted)))
-    found = np.zeros(len(halted), dtype=np.bool_)
+    found = np.zeros(len(halted), dtype=bool)
     for changes in (speeding_up > above_mps2, speeding_up < -above_mps2):
         going_on = ~drop_short_runs(~(changes | halted), rows.piece, min_rows=rows.count(min_s))
         spans = find_runs(going_on, rows.piece)

@@ -51,7 +51,7 @@ def number_pieces(stamp_ns: Ints, epoch: Ints, *, period_ns: float) -> Ints:
 def find_runs(mask: Mask, piece: Ints) -> Ints:
     """Return first and last row of every maximal run of true rows inside one piece, shape (R, 2)."""
     joined = mask[:-1] & mask[1:] & (piece[:-1] == piece[1:])
-    edge = np.zeros(min(len(mask), 1), dtype=np.bool_)
+    edge = np.zeros(min(len(mask), 1), dtype=bool)
     first = np.flatnonzero(mask & ~np.concatenate((edge, joined)))
     last = np.flatnonzero(mask & ~np.concatenate((joined, edge)))
     return np.column_stack((first, last)).astype(np.int64)
@@ -67,7 +67,7 @@ def make_mask(spans: Ints, size: int) -> Mask:
 
 def find_piece_spans(piece: Ints) -> Ints:
     """Return first and last row of every piece, shape (P, 2)."""
-    return find_runs(np.ones(len(piece), dtype=np.bool_), piece)
+    return find_runs(np.ones(len(piece), dtype=bool), piece)
 
 
 def find_piece_bounds(piece: Ints) -> tuple[Ints, Ints]:
@@ -118,7 +118,7 @@ def fit_slope(value: Floats, piece: Ints, *, half_window: int, period_s: float) 
     n = last - first + 1
     middle = 0.5 * (position[first] + position[last])
     covariance = (moment[last + 1] - moment[first]) - middle * (total[last + 1] - total[first])
-    spread = n * (n.astype(np.float64) ** 2 - 1.0) / 12.0
+    spread = n * (n.astype(float) ** 2 - 1.0) / 12.0
     result = np.zeros(len(value))
     np.divide(covariance, spread * period_s, out=result, where=spread > 0)
     return result

@@ -133,7 +133,7 @@ def _find_all(card: DatasetCard) -> dict[tuple[str, str, Subject], Finding]:
 
 
 def _read_values(table: pa.Table, name: str) -> Floats:
-    return np.asarray(table.column(name).to_numpy(), np.float64)
+    return np.asarray(table.column(name).to_numpy(), float)
 
 
 def _measure_changes(directories: tuple[Path, Path]) -> dict[str, dict[str, float]]:
@@ -175,7 +175,7 @@ def _match_by_time(a: pa.Table, b: pa.Table) -> tuple[Ints, Ints]:
 
 def _find_differing(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> Mask:
     """Mark the given rows of two datasets, (N,), that differ in any column; values missing in both are equal."""
-    other = np.zeros(len(both[0][1]), np.bool_)
+    other = np.zeros(len(both[0][1]), bool)
     for name in names:  # one at a time: a large dataset has gigabytes of them
         ours, theirs = (read_samples(directory, [name]).column(name).take(pa.array(rows)) for directory, rows in both)
         one_null = pc.xor(pc.is_null(ours), pc.is_null(theirs))
@@ -192,9 +192,9 @@ def _find_differing_patches(
 ) -> Mask:
     """Mark samples of both, (N,), with different pixels: all if layers or size differ, none if one has no patches."""
     if not (cards[0].layers and cards[1].layers):
-        return np.zeros(len(in_a), np.bool_)
+        return np.zeros(len(in_a), bool)
     if set(cards[0].layers) != set(cards[1].layers) or cards[0].patch_px != cards[1].patch_px:
-        return np.ones(len(in_a), np.bool_)
+        return np.ones(len(in_a), bool)
     ours, theirs = (
         _hash_patches(directory, card, table) for directory, card, table in zip(directories, cards, tables, strict=True)
     )

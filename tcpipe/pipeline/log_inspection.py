@@ -263,7 +263,7 @@ class TopicStamps:
     def topic_times(self) -> TopicTimes:
         """Return them for `tcpipe.logs.clocks`: what repeats a message exactly has its content."""
         log_ns, header_ns, same = self._joined()
-        return TopicTimes(log_ns, header_ns, (np.cumsum(~same).astype(np.float64),))
+        return TopicTimes(log_ns, header_ns, (np.cumsum(~same).astype(float),))
 
     def counts(self) -> StampCounts:
         """Return what they show."""

@@ -127,7 +127,7 @@ class _Clock:
 
     def __init__(self, rows: pa.Table) -> None:
         self._epoch, stamps = _read_column(rows, "clock_epoch"), _read_column(rows, "stamp_ns")
-        self._stamp_ns, self._behind_ns = stamps, (_read_column(rows, "log_time_ns") - stamps).astype(np.float64)
+        self._stamp_ns, self._behind_ns = stamps, (_read_column(rows, "log_time_ns") - stamps).astype(float)
 
     def __call__(self, stamp_ns: Ints, epoch: Ints | None) -> Ints:
         """Return the log time of each stamp [ns]; without epochs a stamp is of the first that holds it."""
@@ -138,8 +138,8 @@ class _Clock:
             mine, known = epoch == number, self._epoch == number
             known = known if known.any() else np.ones_like(known)
             begin = self._stamp_ns[known][0]  # differences are exact in float64, times since 1970 are not
-            at_ns = (stamp_ns[mine] - begin).astype(np.float64)
-            known_ns = (self._stamp_ns[known] - begin).astype(np.float64)
+            at_ns = (stamp_ns[mine] - begin).astype(float)
+            known_ns = (self._stamp_ns[known] - begin).astype(float)
             times[mine] += np.rint(np.interp(at_ns, known_ns, self._behind_ns[known])).astype(np.int64)
         return times
 

@@ -199,15 +199,13 @@ class CellFrames:
 
     def __init__(self, grid: MapGrid, *, where: str) -> None:
         self._grid = grid
-        corners = grid.xy_from_px(
-            np.array([(c, r) for r in (0, grid.rows - 1) for c in (0, grid.cols - 1)], np.float64)
-        )
+        corners = grid.xy_from_px(np.array([(c, r) for r in (0, grid.rows - 1) for c in (0, grid.cols - 1)], float))
         self._corners = make_metres_from_plane(parse_crs(grid.crs, where=where), corners).reshape(2, 2, 2, 2)
 
     def of(self, cells: Cells) -> PatchFrames:
         """Return the frames of cells (flat indices, (n,)), shape (16 n,), courses fastest."""
         row, col = np.divmod(cells, self._grid.cols)
-        centre = self._grid.xy_from_px(np.stack([col, row], axis=1).astype(np.float64))
+        centre = self._grid.xy_from_px(np.stack([col, row], axis=1).astype(float))
         along = np.tile(DIRECTIONS / self.metres(cells)[:, None], (cells.size, 1))
         return PatchFrames(np.repeat(centre, COURSES, axis=0), along, np.stack([-along[:, 1], along[:, 0]], axis=1))
 
@@ -257,7 +255,7 @@ def read_classes(source: MapReader, grid: MapGrid) -> Classes:
     for first, last in iterate_row_strips(grid) if "terrain" in source.layers else ():
         rows = classes[first:last]
         row, col = np.mgrid[first : first + len(rows), : grid.cols]
-        middle = grid.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(np.float64))
+        middle = grid.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(float))
         rows[:] = np.maximum(find_classes_at(source, middle), 0).reshape(rows.shape)
     return classes
 

@@ -345,7 +345,7 @@ def _mean(values: NDArray[np.floating]) -> Floats:
     """Return the mean over the courses that have a value; NaN where none has."""
     known = ~np.isnan(values)
     count = known.sum(axis=0)
-    total = np.where(known, values, 0.0).sum(axis=0, dtype=np.float64)
+    total = np.where(known, values, 0.0).sum(axis=0, dtype=float)
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 

@@ -145,7 +145,7 @@ def _find_class_reasons(patches: Patches, terrain: Bytes, model: Model, source: 
     bits = np.zeros(len(terrain), np.uint16)
     bits[~traversable[patches.terrain_class]] |= np.uint16(Reason.NOT_TRAVERSABLE)
     bits[patches.terrain_class == NODATA_ID] |= np.uint16(Reason.NODATA)
-    seen, known = np.zeros(256, np.bool_), np.zeros(256, np.bool_)
+    seen, known = np.zeros(256, bool), np.zeros(256, bool)
     seen[[class_id for class_id, count in model.card.training_range.class_counts.items() if count > 0]] = True
     known[list(model.card.training_range.pixel_classes)] = True
     if model.card.class_table != source.classes:

@@ -176,7 +176,7 @@ def collect_runs(model: Model, source: MapFile, store: Store, logs: Sequence[str
     for run in runs:
         shift = shifts.get(run.run_id, (0.0, 0.0, 0.0))
         found, reasons = predict_run(model, source, run, sample=recipe.sample, shift=shift)
-        is_good = np.array([not why for why in reasons], np.bool_)
+        is_good = np.array([not why for why in reasons], bool)
         if not is_good.any():
             named = ", ".join(_list_names(reasons)).replace("_", " ") or "it has no segments"
             raise UsageError(
@@ -219,7 +219,7 @@ def compute_drive_cost(
         compute_middles([trained.column(name) for name in PLACES]),
         within_m=CLOSE * model.card.chord_m, in_degrees=True,
     )  # fmt: skip
-    is_good = np.array([not why for why in reasons], np.bool_)
+    is_good = np.array([not why for why in reasons], bool)
     good = {name: metres.take(is_good) for name, metres in found.metres.items()}
     sums = {
         name: IntervalComparison(

@@ -87,7 +87,7 @@ class Frame:
     def find_cells(self, grid: MapGrid, own: MapGrid) -> tuple[Ints, Mask]:
         """Return the flat cell of ``grid`` under the middle of each ``own`` cell of the frame, and which are on it."""
         row, col = np.mgrid[: own.rows, : own.cols]
-        middle = own.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(np.float64))
+        middle = own.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(float))
         px = np.rint(grid.px_from_xy(self.to_plane(middle))).astype(np.int64)
         is_on = np.asarray(((px >= 0) & (px < (grid.cols, grid.rows))).all(axis=1))
         return np.where(is_on, px[:, 1] * grid.cols + px[:, 0], 0), is_on

@@ -209,7 +209,7 @@ def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
     """Find the path that is asked for; write it to ``out``, and beside it messages for Nav2."""
     out = Path(options.out)
     _check_out(out)
-    start, goal = (np.array(end, np.float64) for end in (options.start, options.goal))
+    start, goal = (np.array(end, float) for end in (options.start, options.goal))
     for label, end in (("--from", start), ("--to", goal)):
         check_lonlat(label, end[None])
     check_model(model, source)

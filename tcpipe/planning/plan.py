@@ -310,7 +310,7 @@ class _Search:
         """Yield each path in the map's CRS [m] between the given ends: as steps, and as straight lines of less cost."""
         grid = self.survey.costs.grid
         for path in paths:
-            points = np.stack(np.divmod(path.cells, grid.cols)[::-1], axis=1).astype(np.float64)
+            points = np.stack(np.divmod(path.cells, grid.cols)[::-1], axis=1).astype(float)
             points[[0, -1]] = grid.px_from_xy(self.ends_xy_m)
             yield grid.xy_from_px(points)
             yield grid.xy_from_px(straighten_path(steps, points))

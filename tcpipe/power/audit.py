@@ -207,7 +207,7 @@ def find_lost_signs(sag: Sag | None, start_ns: Ints, end_ns: Ints, rise: Floats)
     Voltage and current rise together there; the likelihoods of both signs are compared. ``rise``: tangent of the slope
     along travel.
     """
-    nothing = np.zeros(len(rise), dtype=np.bool_)
+    nothing = np.zeros(len(rise), dtype=bool)
     if sag is None or not len(rise):
         return nothing
     (volt_0, amp_0), (volt_1, amp_1) = sag.products(start_ns), sag.products(end_ns)

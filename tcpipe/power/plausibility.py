@@ -43,7 +43,7 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     or half of it where other values are near their medians. An exact value that may mean "not measured" is isolated if
     it is farther from both neighbours than usual steps, and is not repeated much longer than other values.
     """
-    rows, found = np.flatnonzero(np.isfinite(values)), np.zeros(len(values), np.bool_)
+    rows, found = np.flatnonzero(np.isfinite(values)), np.zeros(len(values), bool)
     new = np.diff(values[rows], prepend=np.nan) != 0.0
     value, at_s = values[rows][new], time_s[rows][new]
     marked = np.isclose(np.abs(value)[:, None], UNMEASURED_AMP[""], rtol=1e-6, atol=0.0).any(axis=1)

@@ -145,7 +145,7 @@ def compute_power_at(rails: list[Rail], at_ns: Ints, *, max_gap_ns: int) -> tupl
 def _is_near_samples(stamp_ns: Ints, at_ns: Ints, max_gap_ns: int) -> Mask:
     """Return whether each time, shape (M,), is that of a sample, or between two that are near each other."""
     if stamp_ns.size == 0:
-        return np.zeros(at_ns.size, np.bool_)
+        return np.zeros(at_ns.size, bool)
     longest = max(max_gap_ns, _PERIODS * (int(np.median(np.diff(stamp_ns))) if stamp_ns.size > 1 else 1))
     before, last = np.searchsorted(stamp_ns, at_ns, "right") - 1, stamp_ns.size - 1
     after = np.searchsorted(stamp_ns, at_ns, "left")
@@ -160,7 +160,7 @@ def integrate_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: R
     """Return the energy of all rails over each span [J], shape (M,); NaN without rails, or if one is partly unknown."""
     total = np.full(len(start_ns), np.nan if not rails else 0.0)
     for each in rails:
-        inside = np.zeros(len(start_ns), np.bool_)
+        inside = np.zeros(len(start_ns), bool)
         if len(each.stamp_ns) >= 2:
             inside = (start_ns >= each.stamp_ns[0]) & (end_ns <= each.stamp_ns[-1])
         total += np.where(inside, integrate_recorded_energy([each], start_ns, end_ns, rule=rule), np.nan)

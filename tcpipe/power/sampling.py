@@ -51,7 +51,7 @@ def find_readings(stamp_ns: Ints, values: Floats) -> Ints | None:
     messages = _find_reading_period(np.diff(stamp_ns[changed]) / message_ns)
     if messages is None:
         return None
-    at_ns = (stamp_ns - stamp_ns[0]).astype(np.float64)
+    at_ns = (stamp_ns - stamp_ns[0]).astype(float)
     return _find_arrivals(at_ns, changed, period_ns=messages * message_ns, message_ns=message_ns)
 
 

@@ -299,7 +299,7 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
     if source.wraps_amp is not None:
         current = unwrap_currents(current, source.wraps_amp)
     currents = [source.current_scale * read_values(columns, field) for field in parse_fields(source.current)]
-    unmeasured = np.zeros(len(current), np.bool_)
+    unmeasured = np.zeros(len(current), bool)
     if currents:
         unmeasured = find_unmeasured(np.column_stack(currents), _choose_stamps(columns), wraps_amp=source.wraps_amp)
     current = np.where(unmeasured, np.nan, current)
@@ -315,7 +315,7 @@ _BESIDE, _CROWDED = 20, 10.0
 
 def find_unmeasured(parts: Floats, stamp_ns: Ints, *, wraps_amp: float | None = None) -> Mask:
     """Return rows in which one of the currents, shape (N, K), is clipped, or repeats as another changes, (N,)."""
-    found = np.zeros(len(parts), np.bool_)
+    found = np.zeros(len(parts), bool)
     parts = np.where(np.abs(parts) <= _IMPOSSIBLE, parts, np.nan)
     for column, values in enumerate(parts.T):
         wraps = wraps_amp or find_wrap(values)  # the end of an unsigned current is the smallest that flows back
@@ -327,7 +327,7 @@ def find_unmeasured(parts: Floats, stamp_ns: Ints, *, wraps_amp: float | None = 
 def _is_clipped(values: Floats) -> Mask:
     """Return where a current is at the end of its sensor's range: values crowd there, and stay."""
     levels, counts = np.unique(values[np.isfinite(values)], return_counts=True)
-    at_end = np.zeros(len(values), np.bool_)
+    at_end = np.zeros(len(values), bool)
     if len(levels) <= _BESIDE:
         return at_end
     if abs(levels[0]) > abs(levels[-1]):
@@ -340,7 +340,7 @@ def _is_clipped(values: Floats) -> Mask:
 
 def _is_frozen(values: Floats, others: Floats, stamp_ns: Ints) -> Mask:
     """Return rows in which a current repeats for seconds while one of the others, shape (N, K), changes (driving)."""
-    frozen = np.zeros(len(values), np.bool_)
+    frozen = np.zeros(len(values), bool)
     first = np.flatnonzero(np.concatenate(([True], values[1:] != values[:-1])))
     last = np.append(first[1:], len(values)) - 1
     is_long = (last - first >= _FEWEST_EQUAL) & (stamp_ns[last] - stamp_ns[first] >= _FROZEN_NS)
@@ -410,7 +410,7 @@ _IMPOSSIBLE = 1e6
 
 def read_values(columns: Columns, field: FieldPath) -> Floats:
     """Return a field's values, shape (N,); of a list that is summed NaN where a row is shorter than others."""
-    values = np.asarray(columns[field.column], np.float64)
+    values = np.asarray(columns[field.column], float)
     return values.sum(axis=1) if field.every else values if field.index is None else values[:, field.index]
 
 
@@ -441,7 +441,7 @@ def _check_voltage(voltage: Floats, median_volt: float, every_voltage: Floats, c
     if not np.any(voltage):
         return "voltage-zero"
     if _PERCENTAGE in columns:
-        charge = np.asarray(columns[_PERCENTAGE], np.float64)
+        charge = np.asarray(columns[_PERCENTAGE], float)
         if np.all(np.isclose(charge, every_voltage) | np.isclose(100 * charge, every_voltage)):
             return "voltage-is-charge"
     if median_volt > LARGEST_VOLT:

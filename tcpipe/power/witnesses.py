@@ -117,11 +117,11 @@ def _fit_with_instruments(columns: Floats, instruments: Floats, target: Floats, 
     inverse: Floats = np.eye(columns.shape[1])
     value: Floats = np.zeros(columns.shape[1])
     for _ in range(_ITERATIONS):
-        inverse = np.asarray(np.linalg.pinv(fitted.T @ (weight[:, None] * columns)), np.float64)
+        inverse = np.asarray(np.linalg.pinv(fitted.T @ (weight[:, None] * columns)), float)
         value = inverse @ (fitted.T @ (weight * target))
         residual = target - columns @ value
         limit = _HUBER * max(estimate_robust_std(residual), 1e-12)
-        weight = np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-300)).astype(np.float64)
+        weight = np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-300)).astype(float)
     starts = np.arange(0, len(target), _BLOCK_SEGMENTS)
     sums = np.add.reduceat(fitted * (weight * residual)[:, None], starts, axis=0)
     covariance = inverse @ (sums.T @ sums) @ inverse.T * (len(starts) / max(len(starts) - columns.shape[1], 1))

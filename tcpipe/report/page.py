@@ -287,7 +287,7 @@ def make_shown_column(digits: int, values: Floats) -> Column:
 
 
 def _scale(values: GenericArray) -> tuple[float, float]:
-    numbers = values.astype(np.float64)
+    numbers = values.astype(float)
     known = numbers[np.isfinite(numbers)]
     return (float(known.min()), (float(known.max()) - float(known.min())) / 65534 or 1.0) if len(known) else (0.0, 1.0)
 
@@ -296,10 +296,10 @@ def _to_bytes(kind: Kind, values: GenericArray, low: float, step: float) -> byte
     if kind in _WHOLE:
         return values.astype(_WHOLE[kind]).tobytes()
     if kind == "steps":
-        steps = np.round((values.astype(np.float64) - low) / step)
+        steps = np.round((values.astype(float) - low) / step)
         return np.where(np.isfinite(steps), steps, 65535).astype("<u2").tobytes()
     bits = values.astype("<f4").view("<u4")
     if kind == "half":
-        upper = np.where(np.isnan(values.astype(np.float64)), 0x7FC0, (bits.astype(np.uint64) + 0x8000) >> 16)
+        upper = np.where(np.isnan(values.astype(float)), 0x7FC0, (bits.astype(np.uint64) + 0x8000) >> 16)
         return upper.astype("<u2").tobytes()
     return (bits >> 16).astype("<u2").tobytes() + (bits & 0xFFFF).astype("<u2").tobytes()

@@ -27,7 +27,7 @@ from tcpipe.terrain.layers import COLOURS, MAX_ID, ClassTable, Layer, Pixels
 ACROSS = 25
 """Patches in one row of a sheet."""
 
-_CIVIDIS = np.array([[0, 34, 78], [65, 77, 107], [124, 123, 120], [188, 175, 111], [254, 232, 56]], np.float64)
+_CIVIDIS = np.array([[0, 34, 78], [65, 77, 107], [124, 123, 120], [188, 175, 111], [254, 232, 56]], float)
 
 
 def make_picture_uri(pixels: Bytes, *, exact: bool = False) -> str:
@@ -245,7 +245,7 @@ def _make_sheet(stack: GenericArray, layer: Layer) -> tuple[Bytes, bool]:
     """Return patches of a layer as one sheet, and whether all pixels count; a photograph over 98 % of its values."""
     if layer.kind == "categorical":
         return make_sheet(colour_classes(stack, layer.classes)), True
-    values = stack.astype(np.float64)
+    values = stack.astype(float)
     if layer.stack == "greys":
         low, high = np.percentile(values, (1, 99))
         return make_sheet(np.clip((values - low) / max(high - low, 1.0) * 255, 0, 255).astype(np.uint8)), False

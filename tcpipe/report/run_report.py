@@ -203,7 +203,7 @@ def _make_segments_data(
 
 def _find_severities(columns: Mapping[str, Column], findings: Sequence[Finding], spans: Sequence[FindingSpan]) -> Ints:
     """Return the worst severity of each segment, by spans and flags: its place in `SEVERITIES`, or their number."""
-    start_s, end_s = (np.asarray(columns[name][1], np.float64) for name in ("start", "end"))
+    start_s, end_s = (np.asarray(columns[name][1], float) for name in ("start", "end"))
     quality = np.asarray(columns["quality"][1], np.int64)
     concerned = [(finding.severity, (start_s <= last_s) & (end_s >= first_s)) for finding, first_s, last_s in spans]
     flags = {code: int(Quality[entry.flag.upper()]) for code, entry in read_catalogue().items() if entry.flag}

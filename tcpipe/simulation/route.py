@@ -88,7 +88,7 @@ def make_leg_path(start_m: Floats, leg: Leg, *, weave: tuple[Floats, Floats, Flo
 
     ``weave`` holds wavelengths [m], phases [rad] and weights of the sideways weaving, of total amplitude ``weave_m``.
     """
-    corners = np.vstack([start_m, np.asarray(leg.waypoints_m, dtype=np.float64)])
+    corners = np.vstack([start_m, np.asarray(leg.waypoints_m, dtype=float)])
     curvature, straight_m = _compute_curvature(corners, leg.radius_m)
     first = corners[1] - corners[0]
     yaw = np.arctan2(first[1], first[0]) + _integrate(curvature)
@@ -295,7 +295,7 @@ def simulate_drive(
     ``start_yaw_rad`` counts from the map's x axis; ``weave_m`` is how far the human weaves to the side.
     """
     stretches: list[_Stretch] = []
-    place, yaw = np.array(start_m, dtype=np.float64), start_yaw_rad
+    place, yaw = np.array(start_m, dtype=float), start_yaw_rad
     for manoeuvre in plan:
         for stretch in _plan_stretches(world, manoeuvre, place, yaw, robot=robot, weave_m=weave_m, rng=rng):
             stretches.append(stretch)

@@ -157,10 +157,10 @@ def _write_raster(
     site = world.site
     rows, cols = round(site.height_m / pixel_size_m), round(site.width_m / pixel_size_m)
     west, north = site.west_m + shift_m[0], site.south_m + site.height_m + shift_m[1]
-    x = (west + (np.arange(cols) + 0.5) * pixel_size_m).astype(np.float64)
+    x = (west + (np.arange(cols) + 0.5) * pixel_size_m).astype(float)
 
     def strip(first: int, last: int) -> Pixels:
-        y = (north - (np.arange(first, last) + 0.5) * pixel_size_m).astype(np.float64)
+        y = (north - (np.arange(first, last) + 0.5) * pixel_size_m).astype(float)
         return pixels(world, x[None, :], y[:, None])
 
     write_geotiff(path, strip, MapGrid(f"EPSG:{site.epsg}", west, north, pixel_size_m, rows, cols), **options)

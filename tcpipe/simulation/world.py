@@ -206,7 +206,7 @@ OBSTACLE, TREE, VEGETATION, GRASS, MUD, UNPAVED, PAVED = range(1, 8)
 _COLOUR = np.array([
     [0, 0, 0], [120, 60, 56], [32, 52, 30], [58, 84, 44],
     [96, 134, 62], [104, 82, 58], [168, 150, 122], [122, 124, 128],
-], dtype=np.float64)  # fmt: skip
+], dtype=float)  # fmt: skip
 """RGB by class id; 0 is nothing."""
 
 _SOFT_BORDER_M = 0.3

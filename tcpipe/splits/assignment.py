@@ -78,7 +78,7 @@ def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: flo
     arrival : number of each sample's run in the order of recording, shape (N,).
     """
     exact = Fraction(str(test_fraction))  # 0.2 * 35 is 7.000000000000001 in binary
-    test: Mask = np.zeros(len(ranks), np.bool_)
+    test: Mask = np.zeros(len(ranks), bool)
     order, first = np.lexsort((ranks, arrival)), 0
     ends: list[int] = [*(np.flatnonzero(np.diff(arrival[order])) + 1).tolist(), len(order)]
     for end in ends:
@@ -97,7 +97,7 @@ def draw_groups(groups: Groups, arrival: Ints, *, test_fraction: float, seed: in
     ----------
     arrival : number of each sample's run in the order of recording, shape (N,).
     """
-    tests: Mask = np.zeros(len(groups.names), np.bool_)
+    tests: Mask = np.zeros(len(groups.names), bool)
     order = sort_by_rank(groups.names, seed=seed, purpose="test")
     for sizes in _iterate_sizes(groups, arrival):
         free = order[sizes[order] > 0]

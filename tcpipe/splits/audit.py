@@ -80,7 +80,7 @@ class Footprints:
 
 def _audit_split(name: str, held: Ints, run: Ints, train: Footprints, neighbours: Ints) -> HeldOut:
     pairs, apart_m = 0, [np.empty(0)]
-    shares, repeats = np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
+    shares, repeats = np.zeros(len(held), bool), np.zeros(len(held), bool)
     for part in _split_points(np.arange(len(held)), _CHUNK) if len(train.rows) else []:
         rows = held[part]
         queries = train.corners_xy_m[rows]
@@ -107,7 +107,7 @@ def _audit_split(name: str, held: Ints, run: Ints, train: Footprints, neighbours
 
 def compute_middles(ends: Sequence[GenericArray]) -> Floats:
     """Return the middles of chords, shape (N, 2), by the columns `PLACES` [deg] or `LOCAL_PLACES` [m]."""
-    x0, y0, x1, y1 = (end.astype(np.float64) for end in ends)
+    x0, y0, x1, y1 = (end.astype(float) for end in ends)
     return np.column_stack([(x0 + x1) / 2.0, (y0 + y1) / 2.0])
 
 
@@ -120,7 +120,7 @@ def are_near(queries: Floats, references: Floats, *, within_m: float, in_degrees
     if in_degrees and len(queries):
         scale = _M_A_DEG * np.array([np.cos(np.radians(np.nanmean(queries[:, 1]))), 1.0])
     known, others = np.isfinite(queries).all(axis=1), references[np.isfinite(references).all(axis=1)]
-    found = np.zeros(len(queries), np.bool_)
+    found = np.zeros(len(queries), bool)
     if known.any() and len(others):
         origin = others[0]
         tree = cKDTree((others - origin) * scale)

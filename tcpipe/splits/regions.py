@@ -117,7 +117,7 @@ def _cut_lines(borders: BaseGeometry) -> NDArray[np.object_]:
 
 def _is_on_border(squares: NDArray[np.object_], borders: shapely.STRtree, *, buffer_m: float) -> Mask:
     """Tell which squares a border runs through, or passes nearer than the buffer."""
-    found = np.zeros(len(squares), np.bool_)
+    found = np.zeros(len(squares), bool)
     if buffer_m > 0.0:
         (square, _), distance_m = borders.query_nearest(
             squares, max_distance=buffer_m, return_distance=True, all_matches=False

@@ -175,7 +175,7 @@ def compute_segment_costs(
     scale_std = find_common_scale_std(info.report.facts.fuse, start_ns, to_integers(cut, "clock_epoch"))
     cost = compute_labels(
         chord_m=to_floats(cut, "chord_m"),
-        duration_s=(end_ns - start_ns).astype(np.float64) * 1e-9,
+        duration_s=(end_ns - start_ns).astype(float) * 1e-9,
         energy_joule=integrate_energy(rails, start_ns, end_ns, rule=rule),
         end_velocity_mps=interpolate(stamp_ns, ground_mps, end_ns),
         end_power_watt=end_watt,
@@ -201,7 +201,7 @@ def compute_segment_costs(
 def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> Floats:
     """Return the error of each segment's displacement [m], shape (M,): the smoother's, else by the rows' σ."""
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
-    duration_s = (end_ns - start_ns).astype(np.float64) * 1e-9
+    duration_s = (end_ns - start_ns).astype(float) * 1e-9
     lag_std_m = np.column_stack([interpolate(stamp_ns, to_floats(rows, name), start_ns) for name in _DISPLACEMENTS])
     start_std_m, end_std_m = (
         compute_along_std_m(

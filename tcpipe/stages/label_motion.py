@@ -177,7 +177,7 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> Mask:
         times += [(section.clock_epoch, r.start_ns, r.end_ns) for r in section.gate_resets]
         if not section.is_explained(*limits):
             times.append((section.clock_epoch, section.start_ns, section.end_ns))
-    disputed = np.zeros(cut.num_rows, dtype=np.bool_)
+    disputed = np.zeros(cut.num_rows, dtype=bool)
     for of_epoch, first_ns, last_ns in times:
         disputed |= (epoch == of_epoch) & (start_ns <= last_ns) & (end_ns >= first_ns)
     return disputed

@@ -276,7 +276,7 @@ def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts)
             for section in (facts.fuse.stretches if facts.fuse else ())
             if section.clock_epoch == epoch and sensor in section.sensors
         ]
-        touched = np.zeros(len(start_ns), dtype=np.bool_)
+        touched = np.zeros(len(start_ns), dtype=bool)
         for first_ns, last_ns in fused:
             touched |= (start_ns <= last_ns) & (end_ns >= first_ns)
         count += confirms & touched

@@ -89,7 +89,7 @@ def find_outside_windows(track: Track, windows: Sequence[TimeWindow]) -> tuple[M
     Rows are dropped inside a window that drops and, if any window keeps, outside all windows that keep.
     """
     stamp_ns, run_id = to_integers(track.table, "stamp_ns"), track.info.run_id
-    dropped, kept, empty = np.zeros(len(stamp_ns), np.bool_), np.zeros(len(stamp_ns), np.bool_), 0
+    dropped, kept, empty = np.zeros(len(stamp_ns), bool), np.zeros(len(stamp_ns), bool), 0
     mine = [window for window in windows if len(stamp_ns) and window.is_for(run_id)]
     for window in mine:
         start_ns, end_ns = window.find_bounds_ns(int(stamp_ns[0]))
@@ -240,7 +240,7 @@ def find_gaps(
     position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
     velocity_mps = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
     off_m = np.append(compute_unexplained_m(stamp_ns, position_m, velocity_mps, rows.piece), 0.0)
-    jumps = np.zeros(len(moving), dtype=np.bool_)
+    jumps = np.zeros(len(moving), dtype=bool)
     steps = np.flatnonzero(off_m > config.max_relative_position_std_m)
     jumps[steps] = jumps[steps + 1] = True
     run, findings = Subject("run", track.info.run_id), []

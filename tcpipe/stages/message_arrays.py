@@ -107,13 +107,13 @@ def _is_list(kind: pa.DataType) -> bool:
 
 def _make_matrix(lists: pa.Array) -> Floats:
     if pa.types.is_fixed_size_list(lists.type):
-        values: Floats = to_numbers(pc.list_flatten(lists)).astype(np.float64, copy=False)
+        values: Floats = to_numbers(pc.list_flatten(lists)).astype(float, copy=False)
         return values.reshape(len(lists), lists.type.list_size)
     return _fill_nulls(to_numbers(pc.list_value_length(lists)).astype(np.int64), pc.list_flatten(lists))
 
 
 def _fill_nulls(lengths: Ints, flat: pa.Array) -> Floats:
-    return _fill_rows(lengths, to_numbers(flat).astype(np.float64, copy=False), np.nan)
+    return _fill_rows(lengths, to_numbers(flat).astype(float, copy=False), np.nan)
 
 
 def _fill_rows(lengths: Ints, values: NDArray[T], empty: float | str) -> NDArray[T]:
@@ -135,7 +135,7 @@ def read_transforms(table: pa.Table) -> Transforms:
 
     def vectors(name: str, components: str) -> Floats:
         parts = [pc.struct_field(flat, ["transform", name, component]) for component in components]
-        return np.stack([to_numbers(part).astype(np.float64) for part in parts], -1)
+        return np.stack([to_numbers(part).astype(float) for part in parts], -1)
 
     return Transforms(
         names("header", "frame_id"), names("child_frame_id"), vectors("translation", "xyz"), vectors("rotation", "xyzw")

@@ -83,7 +83,7 @@ def judge_fields(role: str, found: Mapping[str, str], columns: Columns) -> tuple
 
     ``found``: matched names; ``columns``: their values by field.
     """
-    values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
+    values = {name: np.asarray(column, float) for name, column in columns.items()}
     values = {name: value[np.isfinite(value) & (value != 0.0)] for name, value in values.items()}
     return _judge_fixes(dict(found), values) if role == "gnss" else _judge_imu(dict(found), values)
 

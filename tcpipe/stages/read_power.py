@@ -83,7 +83,7 @@ def add_side_share(power: PowerReadings, streams: Mapping[str, pa.Table]) -> Pow
     motion = _choose_odometry(streams)
     if power.facts is None or power.sides is None or motion is None:
         return power
-    at_ns = to_integers(motion, "log_time_ns").astype(np.float64)
+    at_ns = to_integers(motion, "log_time_ns").astype(float)
     order = np.argsort(at_ns, kind="stable")
     speed_mps, turn_radps = (
         np.interp(power.sides.log_time_ns, at_ns[order], np.abs(to_floats(motion, name))[order])
@@ -123,7 +123,7 @@ def select_power_rows(columns: Columns, rails: Sequence[RailReadings]) -> Readin
     for rail in rails:
         if rail.counter is not None:
             energy, resets = name_counter_columns(rail.name)
-            values |= {energy: rail.counter.energy_joule, resets: rail.counter.resets.astype(np.float64)}
+            values |= {energy: rail.counter.energy_joule, resets: rail.counter.resets.astype(float)}
     stamps = read_header_ns(columns)
     lost = row[-1] + 1 - row[0] - len(row) if len(row) else len(columns[LOG_TIME])
     return Readings(
@@ -187,7 +187,7 @@ def _compute_power_at_currents(rail: pa.Table) -> tuple[Ints, Floats]:
         to_floats(rail, "voltage_volt"),
         to_floats(rail, "current_amp"),
     )
-    at_ns = (stamp_ns - stamp_ns[0]).astype(np.float64)
+    at_ns = (stamp_ns - stamp_ns[0]).astype(float)
     of_voltage, of_current = np.isfinite(voltage), np.isfinite(current)
     if not of_voltage.any():
         return stamp_ns[:0], current[:0]

@@ -126,7 +126,7 @@ def _join_topics(sources: Sequence[TopicReadings], config: ReadConfig, findings:
             findings.append(make_finding("topic-left-out", subject, names=names))
         else:
             at_ns = source.readings.log_time_ns
-            overlaps = np.zeros(len(at_ns), np.bool_)
+            overlaps = np.zeros(len(at_ns), bool)
             for used_ns in [other.readings.log_time_ns for other in before if len(other.readings.row)]:
                 overlaps |= (used_ns[0] <= at_ns) & (at_ns <= used_ns[-1])
             if count := int(overlaps.sum()):

@@ -46,7 +46,7 @@ def number_column(values: AnyArray, *, nan_is_null: bool = False) -> pa.Array:
         packed = np.packbits(values.view(np.uint8) != 0, bitorder="little")
         return pa.Array.from_buffers(pa.bool_(), values.size, [None, pa.py_buffer(packed)])
     values = np.ascontiguousarray(values, values.dtype.newbyteorder("="))
-    known = ~np.isnan(values) if nan_is_null else np.ones(1, np.bool_)
+    known = ~np.isnan(values) if nan_is_null else np.ones(1, bool)
     valid = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
     return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), values.size, [valid, pa.py_buffer(values)])
 
@@ -188,7 +188,7 @@ class TableSchema:
 
 def to_floats(table: pa.Table, name: str) -> Floats:
     """Return a column as float64, null as NaN, shape (N,)."""
-    return np.asarray(to_numbers(table.column(name)), np.float64)
+    return np.asarray(to_numbers(table.column(name)), float)
 
 
 def stack_floats(table: pa.Table, *names: str) -> Floats:

@@ -68,7 +68,7 @@ class ClassTable:
 
     def traversable(self) -> Mask:
         """Return whether each id may be driven over, shape (256,)."""
-        found = np.zeros(MAX_ID + 1, np.bool_)
+        found = np.zeros(MAX_ID + 1, bool)
         for entry in self.classes:
             found[entry.id] = entry.traversable
         return found
@@ -213,7 +213,7 @@ class Layer:
         if self.classes is not None:
             ids = np.arange(1, self.classes.count + 1)
             return np.stack([np.mean(pixels == class_id, axis=(1, 2)) for class_id in ids], axis=1)
-        values = pixels.reshape(len(pixels), 1, -1).astype(np.float64)
+        values = pixels.reshape(len(pixels), 1, -1).astype(float)
         has_data = np.isfinite(values) if np.isnan(self.nodata) else values != self.nodata
         return np.asarray(np.where(has_data, values, 0.0).sum(axis=2) / np.maximum(has_data.sum(axis=2), 1))
 

@@ -167,7 +167,7 @@ class Projection:
             raise MapError(
                 f"points cannot be taken from {self.source.name!r} to {self.target.name!r}: {error}"
             ) from error
-        return np.stack([np.asarray(x, np.float64), np.asarray(y, np.float64)], axis=-1)
+        return np.stack([np.asarray(x, float), np.asarray(y, float)], axis=-1)
 
     def find_rough_shift(self, subject: Subject) -> tuple[Finding, ...]:
         """Return a finding if the two datums differ and their shift is rough, unknown or given by a file."""

@@ -184,7 +184,7 @@ def _sample_heights(level: MapReader, xy_m: Floats) -> Floats:
     for group in group_by_tile(px, level):
         first, last = (np.floor(ends).astype(int) for ends in (px[group].min(axis=0), px[group].max(axis=0) + 1.0))
         (col0, row0), (col1, row1) = first - reach_px, last + reach_px
-        window = read_tile_window(level, "height", row0, row1, col0, col1).astype(np.float64)
+        window = read_tile_window(level, "height", row0, row1, col0, col1).astype(float)
         x, y = px[group, 0, None] - col0 + offset_px, px[group, 1, None] - row0 - offset_px  # rows run south
         places = np.broadcast_arrays(y[:, :, None], x[:, None, :])
         found[group] = map_coordinates(window, places, order=1)

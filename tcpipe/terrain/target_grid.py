@@ -189,7 +189,7 @@ def compute_source_lattice(  # noqa: PLR0917
     step = LATTICE_STEP_PX
     i = row0 - step + step * np.arange(-(-rows // step) + 3)
     j = col0 - step + step * np.arange(-(-cols // step) + 3)
-    px = np.stack(np.broadcast_arrays(j[None, :].astype(np.float64), i[:, None].astype(np.float64)), axis=-1)
+    px = np.stack(np.broadcast_arrays(j[None, :].astype(float), i[:, None].astype(float)), axis=-1)
     xy_m = grid.xy_from_px(px)
     if projection is None:
         return raster.px_from_xy(xy_m)

@@ -174,7 +174,7 @@ def _list_touched(boxes: Ints, side: int, shape: tuple[int, int]) -> list[tuple[
     """Return the tiles of the map that boxes touch, row by row."""
     first, last = boxes[:, :2] // side, (boxes[:, 2:] - 1) // side
     rows, cols = (last - first + 1).max(axis=0, initial=0).tolist()
-    touched = np.zeros(shape, np.bool_)
+    touched = np.zeros(shape, bool)
     for i, j in product(range(rows), range(cols)):
         tile = first + np.array([i, j])
         inside = ((tile >= 0) & (tile < shape) & (tile <= last)).all(axis=1)

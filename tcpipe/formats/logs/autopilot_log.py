@@ -154,7 +154,7 @@ def _find_stray(time_us: Ints) -> Mask:
     """Return which times, in the order of the file, are far from the median of those around them."""
     steps = np.diff(time_us)
     if len(time_us) < _WINDOW or not (steps < 0).any():
-        return np.zeros(len(time_us), np.bool_)
+        return np.zeros(len(time_us), bool)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(time_us, _WINDOW // 2, mode="edge"), _WINDOW)
     return np.asarray(np.abs(time_us - np.median(around, axis=1)) > _STRAY_US + 10 * np.median(np.abs(steps)))
 

@@ -261,18 +261,18 @@ class BagPart(ChunkedPart[_Chunk]):
         data, offset, entries = found.data, found.offset, found.entries
         none = Messages(data, entries.channel, offset, offset, offset, entries.log_time_ns, entries.log_time_ns)
         if not len(offset):
-            return none, np.zeros(0, np.bool_)
+            return none, np.zeros(0, bool)
         room = entries.end - entries.offset
         length = int(gather_integers(data, offset[:1], "u4")[0])
         fits = room >= length + 8
         if not fits[0] or length > MAX_HEADER_BYTES:
-            return none, np.zeros(len(offset), np.bool_)
+            return none, np.zeros(len(offset), bool)
         windows: Bytes = np.ndarray((len(data) - length - 7, length + 8), np.uint8, data, 0, (1, 1))
         heads = windows[np.where(fits, offset, offset[0])]
         conn_at, time_at = _find_message_fields(heads[0, 4 : length + 4].tobytes())
         if not conn_at or not time_at:
-            return none, np.zeros(len(offset), np.bool_)
-        varies = np.zeros(length + 8, np.bool_)
+            return none, np.zeros(len(offset), bool)
+        varies = np.zeros(length + 8, bool)
         varies[conn_at : conn_at + 4] = varies[time_at : time_at + 8] = varies[length + 4 :] = True
         channel = heads[:, conn_at : conn_at + 4].copy().view("<u4")[:, 0].astype(np.int64)
         times = heads[:, time_at : time_at + 8].copy().view("<u4").astype(np.int64)

@@ -280,7 +280,7 @@ def sort_by_place(
     Of those that are not, a message would begin outside the chunk, or have less than ``least_bytes`` before the next.
     """
     outside = (offset < 0) | (offset >= sizes[chunk])
-    sound = np.ones(len(sizes), np.bool_)
+    sound = np.ones(len(sizes), bool)
     sound[chunk[outside]] = False
     order = np.argsort((chunk << _PLACE_BITS) + np.where(outside, 0, offset), kind="stable")
     chunk, channel, offset, log_time_ns = chunk[order], channel[order], offset[order], log_time_ns[order]
@@ -298,7 +298,7 @@ def lay_out_pieces(entries: Entries) -> tuple[dict[int, list[Piece]], Ints, int]
     That is the pieces of each chunk by its number; where each message then begins, in the order of the entries; and the
     bytes in all.
     """
-    begins = np.ones(len(entries.offset), np.bool_)
+    begins = np.ones(len(entries.offset), bool)
     far = entries.offset[1:] - entries.end[:-1] > _GAP_BYTES
     begins[1:] = far | (entries.chunk[1:] != entries.chunk[:-1])
     at = np.flatnonzero(begins)

@@ -193,7 +193,7 @@ def index_messages(data: bytes, records: Ints, ends: Ints, channels: Ints) -> tu
     chunk.
     """
     whole = np.flatnonzero(records + RECORD_HEAD + 6 <= ends)
-    right, size = np.zeros(len(records), np.bool_), np.zeros(len(records), np.int64)
+    right, size = np.zeros(len(records), bool), np.zeros(len(records), np.int64)
     if len(whole):
         at = records[whole]
         size[whole] = gather_integers(data, at + RECORD_HEAD + 2, "u4")

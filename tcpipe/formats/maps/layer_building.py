@@ -61,7 +61,7 @@ class Raster:
         low = np.maximum(self._corners[:, ::2], (row0, col0))
         high = np.minimum(self._corners[:, 1::2], (row1, col1))
         values = np.zeros((row1 - row0, col1 - col0), self.tiles[0].dtype)
-        valid = np.zeros(values.shape, np.bool_)
+        valid = np.zeros(values.shape, bool)
         for n in np.flatnonzero((low < high).all(axis=1)).tolist():
             (top, left), (bottom, right) = low[n].tolist(), high[n].tolist()
             (row, _, col, _), step, tile = self._corners[n].tolist(), self.step, self.tiles[n]
@@ -180,14 +180,14 @@ def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, fl
 
 def _find_grid_positions(tiles: Sequence[Tile], base: int) -> tuple[Floats, Mask]:
     """Return column and row of every tile's first pixel on the grid of one tile, shape (T, 2), and which are off it."""
-    affines = np.array([tile.affine for tile in tiles], np.float64).reshape(-1, 2, 3)
+    affines = np.array([tile.affine for tile in tiles], float).reshape(-1, 2, 3)
     sizes = np.array([(tile.cols, tile.rows) for tile in tiles])
     starts = affines[:, :, 2] - affines[base, :, 2]
     if tiles[base].crs and CRS(tiles[base].crs).is_geographic:  # tiles across the antimeridian count on beyond 180°
         starts[:, 0] -= 360.0 * np.round(starts[:, 0] / 360.0)
     ends = starts + np.einsum("nij,nj->ni", affines[:, :, :2], sizes)
     first, last = (np.linalg.solve(affines[base, :, :2], xy.T).T for xy in (starts, ends))
-    at = np.rint(first).astype(np.float64)
+    at = np.rint(first).astype(float)
     far = np.maximum(np.abs(first - at), np.abs(last - (at + sizes))).max(axis=1)
     return at, ~(far <= _OFF_GRID_PX)
 
@@ -412,7 +412,7 @@ class RasterLayer:
             self.tally.plateaus[1.0].count(values, valid, min_step=max(steep, read_threshold(_ISOLATED, "min_step_m")))
         for sign, plateau in self.tally.plateaus.items() if self.layer.name == "ortho" else ():
             plateau.count(sign * values, valid, min_step=read_threshold(_ISOLATED, "min_step_grey"))
-        source = np.where(valid, values, np.nan).astype(np.float64, copy=False)
+        source = np.where(valid, values, np.nan).astype(float, copy=False)
         if parts > 1:
             mean(source, lattice, parts, part)
         else:

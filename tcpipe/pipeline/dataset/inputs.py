@@ -288,7 +288,7 @@ def remove_duplicates(runs: Sequence[StoredRun]) -> tuple[tuple[StoredRun, ...],
         if twin != run.run_id:
             findings.append(_find_twice(run, run.facts.segments, [twin]))
             continue
-        twice, others = np.zeros(run.facts.segments, np.bool_), []
+        twice, others = np.zeros(run.facts.segments, bool), []
         apart_ns = np.maximum(start_ns[:index], start_ns[index]) - np.minimum(end_ns[:index], end_ns[index])
         for earlier in np.flatnonzero((apart_ns <= _SAME_TIME_NS) & (robot[:index] == run.facts.robot)).tolist():
             if earlier in kept:

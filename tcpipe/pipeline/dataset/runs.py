@@ -298,7 +298,7 @@ def _iterate_usable(
     """Yield each run's segments that can become samples; add missing columns to ``lacks``, lost metres to ``lost``."""
     for run in runs:
         segments = run.segments()
-        arc_m, usable = to_floats(segments, "arc_length_m"), np.ones(segments.num_rows, np.bool_)
+        arc_m, usable = to_floats(segments, "arc_length_m"), np.ones(segments.num_rows, bool)
         lacks[run.run_id] = []
         for need in needs:
             rows = need.find_rows(segments)
@@ -306,7 +306,7 @@ def _iterate_usable(
             usable &= rows
             if not rows.any():
                 lacks[run.run_id].append(need.lack)
-        twice = usable & again.get(run.run_id, np.zeros(len(usable), np.bool_))
+        twice = usable & again.get(run.run_id, np.zeros(len(usable), bool))
         lost[Loss.RECORDED_TWICE].append(float(arc_m[twice].sum()))
         usable &= ~twice
         yield segments if usable.all() else segments.filter(pa.array(usable))
