@@ -64,12 +64,12 @@ class SampleColumns:
             there = sample_columns(self.directory)
             if name not in there:
                 raise DatasetError(f"{self.directory}: its samples have no column {name!r}; it has {', '.join(there)}")
-            self._read[name] = read_samples(self.directory, [name]).column(name).take(pa.array(self.rows)).to_numpy()
+            self._read[name] = read_samples(self.directory, [name]).column(name).take(self.rows).to_numpy()
         return self._read[name]
 
     def table(self) -> pa.Table:
         """Return all columns."""
-        return read_samples(self.directory).take(pa.array(self.rows))
+        return read_samples(self.directory).take(self.rows)
 
 
 @dataclass(eq=False, repr=False)
@@ -134,7 +134,7 @@ class Split:
     @property
     def samples(self) -> pa.Table:
         """Every column of samples.parquet, one row a sample."""
-        return self._columns.table().take(pa.array(self.view.at))
+        return self._columns.table().take(self.view.at)
 
     @property
     def label_columns(self) -> tuple[str, ...]:

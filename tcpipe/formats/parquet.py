@@ -317,11 +317,11 @@ def take_rows(table: pa.Table, rows: Ints) -> pa.Table:
     for batch in table.to_batches():
         begin, end = np.searchsorted(ascending, (first, first + batch.num_rows))
         if begin < end:
-            taken.append(batch.take(pa.array(ascending[begin:end] - first)))
+            taken.append(batch.take(ascending[begin:end] - first))
         first += batch.num_rows
     back = np.empty(len(rows), np.int64)
     back[order] = np.arange(len(rows))
-    return pa.Table.from_batches(taken, table.schema).take(pa.array(back))
+    return pa.Table.from_batches(taken, table.schema).take(back)
 
 
 def make_mapped_array(directory: Path, shape: tuple[int, ...], dtype: DTypeLike) -> AnyArray:

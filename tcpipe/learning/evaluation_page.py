@@ -314,7 +314,7 @@ def draw_predictions(table: pa.Table, audit: str) -> PageSection:
 
 def make_worst_section(table: pa.Table) -> PageSection:
     """Return the samples of each split with the largest errors of E, or of T without energy, largest first."""
-    worst, quantity = table.take(pa.array(find_worst_rows(table, _WORST))), find_main_cost(table)
+    worst, quantity = table.take(find_worst_rows(table, _WORST)), find_main_cost(table)
     off, slope = compute_cost_errors(worst, quantity), np.degrees(to_floats(worst, "slope_rad"))
     label, std = (to_floats(worst, make_column_name(quantity, part)) for part in ("", "std"))
     texts = [to_texts(worst.column(name)) for name in ("split", "sample_id", "terrain_name")]

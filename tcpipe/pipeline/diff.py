@@ -177,7 +177,7 @@ def _find_differing(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> 
     """Mark the given rows of two datasets, (N,), that differ in any column; values missing in both are equal."""
     other = np.zeros(len(both[0][1]), bool)
     for name in names:  # one at a time: a large dataset has gigabytes of them
-        ours, theirs = (read_samples(directory, [name]).column(name).take(pa.array(rows)) for directory, rows in both)
+        ours, theirs = (read_samples(directory, [name]).column(name).take(rows) for directory, rows in both)
         one_null = pc.xor(pc.is_null(ours), pc.is_null(theirs))
         other |= pc.coalesce(pc.not_equal(ours, theirs), one_null).to_numpy()
     return other

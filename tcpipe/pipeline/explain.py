@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from tcpipe import __version__
@@ -225,7 +224,7 @@ def _iterate_rejections(run: StoredRun, start_ns: int, end_ns: int) -> Iterator[
     table = run.rejections()
     stamps = to_integers(table, "stamp_ns")
     near = (stamps >= start_ns - _NEARBY_NS) & (stamps <= end_ns + _NEARBY_NS)
-    rows = table.filter(pa.array(near)).select(["role", "reason"]).to_pylist()
+    rows = table.filter(near).select(["role", "reason"]).to_pylist()
     for (role, reason), count in sorted(Counter((row["role"], row["reason"]) for row in rows).items()):
         yield NearbyRefusal(role, reason, count)
 

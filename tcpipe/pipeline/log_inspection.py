@@ -258,7 +258,7 @@ class TopicStamps:
             same[again] = _find_repeated_rows(rows, again)
             header_ns = header_ns[-table.num_rows :].copy()
         self._pieces.append((to_integers(table, "log_time_ns").copy(), header_ns, same[-table.num_rows :]))
-        self._last = table.take(pa.array([table.num_rows - 1]))  # a slice would keep all of it
+        self._last = table.take([table.num_rows - 1])  # a slice would keep all of it
 
     def topic_times(self) -> TopicTimes:
         """Return them for `tcpipe.logs.clocks`: what repeats a message exactly has its content."""
@@ -311,7 +311,7 @@ def _find_repeated_rows(table: pa.Table, rows: Ints) -> Mask:
         left = np.flatnonzero(same)
         if not len(left):
             break
-        own, before = (column.take(pa.array(rows[left] - back)).combine_chunks() for back in (0, 1))
+        own, before = (column.take(rows[left] - back).combine_chunks() for back in (0, 1))
         if pa.types.is_primitive(column.type) and not pa.types.is_boolean(column.type):
             values = [
                 np.ascontiguousarray(column.to_numpy()).view(f"V{column.type.byte_width}") for column in (own, before)

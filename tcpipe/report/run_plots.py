@@ -150,7 +150,7 @@ def make_rail_series(power: pa.Table, timeline: Timeline) -> Iterator[Series]:
     """Yield voltage and current of each rail as measured, or its power where only that is known."""
     rails = to_texts(power.column("rail"))
     for rail in dict.fromkeys(rails.tolist()):
-        rail_power = power.filter(pa.array(rails == rail))
+        rail_power = power.filter(rails == rail)
         quantities: tuple[tuple[str, str, int], ...] = (("voltage", "voltage_volt", 2), ("current", "current_amp", 3))
         if is_power_only(to_floats(rail_power, "voltage_volt")):
             quantities = (("power", "current_amp", 2),)
@@ -169,7 +169,7 @@ def _compute_seconds(table: pa.Table, timeline: Timeline) -> Floats:
 def make_speed_series(role: str, table: pa.Table, timeline: Timeline) -> Series | None:
     """Return the speed [m/s] of a sensor: measured, else by positions a second apart; None without either."""
     t_s = _compute_seconds(table, timeline)
-    table, t_s = table.filter(pa.array(np.isfinite(t_s))), t_s[np.isfinite(t_s)]
+    table, t_s = table.filter(np.isfinite(t_s)), t_s[np.isfinite(t_s)]
     speed = _read_speed(table)
     if not np.isfinite(speed).any():
         t_s, speed = _compute_chord_speed(table, t_s)

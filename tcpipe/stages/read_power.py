@@ -247,7 +247,7 @@ def remove_repeats(streams: Streams) -> tuple[Streams, list[RepeatedValues]]:
         return streams, []
     columns = {name: power[name] for name in power.column_names}
     columns |= {column: np.where(kept[quantity], values[quantity], np.nan) for quantity, column in _QUANTITIES.items()}
-    table = STREAMS["power"].table(**columns).filter(pa.array(kept["current"] | kept["voltage"]))
+    table = STREAMS["power"].table(**columns).filter(kept["current"] | kept["voltage"])
     return {**streams, "power": table}, repeats
 
 

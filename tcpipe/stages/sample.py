@@ -224,7 +224,7 @@ def sample_on_maps(
     parts: list[Sampled] = []
     each = zip(sources, pools or [None] * len(sources), shifts or [{}] * len(sources), strict=True)
     for number, (source, pool, moved) in enumerate(each):
-        here = segments if len(waiting) == segments.num_rows else segments.take(pa.array(waiting))
+        here = segments if len(waiting) == segments.num_rows else segments.take(waiting)
         found = sample_segments(here, source, config, gnss_crs=gnss_crs, pool=pool, shifts=moved)
         known = found.lost_by != Loss.OUTSIDE_MAP  # a hole in one map outweighs lying outside the next
         lost_by[waiting[known]] = found.lost_by[known]

@@ -207,7 +207,7 @@ def fit_physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
     for robot in sorted(pc.unique(samples.column("robot")).to_pylist()):
         rows = np.flatnonzero(pc.equal(samples.column("robot"), robot).to_numpy())
         rows = rows[np.argsort(start_ns[rows], kind="stable")]
-        mine = samples.select(_FITTED).take(pa.array(rows[:: -(-rows.size // _MOST_FITTED)]))
+        mine = samples.select(_FITTED).take(rows[:: -(-rows.size // _MOST_FITTED)])
         fit = fit_and_validate_physics(make_fit_samples(mine), idle_watt=compute_mean_idle_power(mine))
         if fit is not None:
             found[robot] = fit

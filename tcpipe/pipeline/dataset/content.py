@@ -360,7 +360,7 @@ def make_added_columns(
     covariates = list[Covariate]()
     for source in tables:
         joined, reached = source.join(to_integers(segments, "start_ns"), max_age_s=config.max_age_s)
-        without = {name: int(joined.column(name).take(pa.array(kept)).null_count) for name in joined.column_names}
+        without = {name: int(joined.column(name).take(kept).null_count) for name in joined.column_names}
         covariate = Covariate(
             source.name, source.checksum, source.rows.height, source.time_column, *source.span, without
         )

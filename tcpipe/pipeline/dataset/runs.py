@@ -309,7 +309,7 @@ def _iterate_usable(
         twice = usable & again.get(run.run_id, np.zeros(len(usable), bool))
         lost[Loss.RECORDED_TWICE].append(float(arc_m[twice].sum()))
         usable &= ~twice
-        yield segments if usable.all() else segments.filter(pa.array(usable))
+        yield segments if usable.all() else segments.filter(usable)
 
 
 def move_losses(distance_by_reason_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dict[str, float]:
