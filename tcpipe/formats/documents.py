@@ -320,14 +320,8 @@ def _read_document(place: Place, name: Name) -> bytes | None:
 
 def _read_index(place: Place) -> dict[str, bytes]:
     """Return what the index has of documents by name."""
-    with suppress(StoreError):
-        return _parse_index(place.read(INDEX) or b"")
-    return {}
-
-
-def _parse_index(data: bytes) -> dict[str, bytes]:
     with suppress(StoreError, KeyError):
-        table = read_parquet_bytes(data, INDEX)
+        table = read_parquet_bytes(place.read(INDEX) or b"", INDEX)
         rows = dict(zip(table["name"].to_pylist(), table["facts"].to_pylist(), strict=True))
         if (table.schema.metadata or {}).get(_SEAL) == _seal(rows):
             return rows

@@ -322,7 +322,11 @@ class BagPart(ChunkedPart[_Chunk]):
         held: list[bytes] = []
         places: list[tuple[int, int, int]] = []
         unsound = []
-        self._bytes.expect([_find_needed_bytes(chunk.offset, chunk.record) for chunk in chunks if chunk.record])
+        records = [(chunk.offset, chunk.record) for chunk in chunks if chunk.record]
+        starts = [(each.end if each.codec == "none" else offset, each.end) for offset, each in records]
+        self._bytes.expect(
+            [(start, end + _INDEX_HEAD_BYTES - start) for start, end in starts]
+        )  # of a plain one, indexes
         for number, chunk in enumerate(chunks):
             try:
                 found = self._index_of(chunk)
@@ -538,13 +542,6 @@ class BagPart(ChunkedPart[_Chunk]):
         """Note the damage of a chunk that is lost as a whole, counted by the bag's index."""
         lost = sum(chunk.counts.values()) if chunk.counts else None
         self._note(error.cause, chunk.offset, messages_lost=lost, reason=error.reason)
-
-
-def _find_needed_bytes(offset: int, record: BagRecord) -> tuple[int, int]:
-    """Return the bytes (offset, size) to read of a chunk with wanted messages; of a plain chunk, first its indexes."""
-    return (
-        (record.end, _INDEX_HEAD_BYTES) if record.codec == "none" else (offset, record.end + _INDEX_HEAD_BYTES - offset)
-    )
 
 
 def _make_topic(connection: _Connection) -> Topic:

@@ -8,7 +8,7 @@ import os
 import resource
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from types import TracebackType
@@ -89,11 +89,10 @@ def open_log(path: Location, *, message_definitions: Path | None = None) -> Log:
             raise LogError(f"{path}: it is a pipe or a device; {WANTED}")
         fetched = {file: FetchedFile(place, file) for file, place in stored.items()}
         if path.is_dir():
-            opened = _open_directory(path, stack, fetched)
+            listed, parts = _open_directory(path, stack, fetched)
         else:
-            part = open_part(path, path.name, stack, fetched.get(path))
-            opened = _OpenFiles(part.container, Rosbag2Files((path,)), (part,), fetched)
-        return Log(path, opened, TypeLibrary(message_definitions), stack.pop_all())
+            listed, parts = Rosbag2Files((path,)), [open_part(path, path.name, stack, fetched.get(path))]
+        return Log(path, listed, parts, fetched.values(), TypeLibrary(message_definitions), stack.pop_all())
 
 
 def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | None) -> LogPart:
@@ -216,16 +215,6 @@ def hash_files(files: Iterable[Path], size_bytes: int) -> str:
     return digest.hexdigest()
 
 
-@dataclass(frozen=True, slots=True)
-class _OpenFiles:
-    """The files of a log, open, and what metadata.yaml says of them."""
-
-    container: str
-    listed: Rosbag2Files
-    parts: tuple[LogPart, ...]
-    fetched: Mapping[Path, FetchedFile]
-
-
 class OpenLog:
     """Files that are open for reading until the ``stack`` is closed. Use as a context manager, or close it."""
 
@@ -261,17 +250,24 @@ class OpenLog:
 class Log(OpenLog):
     """A log of ROS."""
 
-    def __init__(self, path: Path, opened: _OpenFiles, types: TypeLibrary, stack: ExitStack) -> None:
-        super().__init__(stack, opened.listed.paths)
+    def __init__(  # noqa: PLR0917
+        self,
+        path: Path,
+        listed: Rosbag2Files,
+        parts: Sequence[LogPart],
+        fetched: Iterable[FetchedFile],
+        types: TypeLibrary,
+        stack: ExitStack,
+    ) -> None:
+        super().__init__(stack, listed.paths)
         self.path = path
-        self.container = opened.container
+        self.container = "rosbag2" if path.is_dir() else parts[0].container
         """``mcap``, ``bag`` or ``rosbag2``."""
-        self._parts, self._types = opened.parts, types
-        self._fetched = tuple(opened.fetched.values())
-        self._damage = list(opened.listed.damage)
+        self._parts, self._types, self._fetched = parts, types, tuple(fetched)
+        self._damage = list(listed.damage)
         self.topics = self._merged_topics()
         """Every topic by name, from the index."""
-        self._compare_counts(opened.listed)
+        self._compare_counts(listed)
 
     def _compare_counts(self, listed: Rosbag2Files) -> None:
         """Note where metadata.yaml counts more messages than the files hold, in all or of topics."""
@@ -398,9 +394,8 @@ class Log(OpenLog):
         wanted = list(dict.fromkeys(topics))
         unknown = [name for name in wanted if name not in self.topics]
         if unknown:
-            raise LogError(
-                *(f"{self.path}: there is no topic {name}; it has {_format_list(self.topics)}" for name in unknown)
-            )
+            there = ", ".join(sorted(self.topics)) or "no topics"
+            raise LogError(*(f"{self.path}: there is no topic {name}; it has {there}" for name in unknown))
         types, columns = dict[str, MessageType](), 0
         for name in wanted:
             found = self._message_type(name)
@@ -491,7 +486,9 @@ class Log(OpenLog):
         return topics
 
 
-def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:
+def _open_directory(
+    directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]
+) -> tuple[Rosbag2Files, list[LogPart]]:
     """Open the files of a ROS 2 bag; one that cannot be opened costs only itself."""
     try:
         found = find_rosbag2_files(directory)
@@ -511,7 +508,7 @@ def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, Fe
             damage.append(Damage("data-unreadable", f"{directory.name}/{file.name}", reason=str(error)))
     if not parts:
         raise LogError(*(problem for error in errors for problem in error.problems))
-    return _OpenFiles("rosbag2", replace(found, damage=tuple(damage)), tuple(parts), fetched)
+    return replace(found, damage=tuple(damage)), parts
 
 
 def _allow_files(count: int) -> None:
@@ -557,7 +554,3 @@ def _is_directory(entry: os.DirEntry[str]) -> bool:
     with suppress(OSError):
         return entry.is_dir()
     return False
-
-
-def _format_list(topics: Iterable[str]) -> str:
-    return ", ".join(sorted(topics)) or "no topics"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import struct
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -39,9 +38,6 @@ _FEW_RECORDS, _LEAST_RECORD_BYTES = 1 << 20, 4
 _PLAUSIBLE_TOTAL = 1 << 30
 _SEARCH_BYTES = 1 << 20
 
-_LZ4_HEAD = struct.Struct("<4sBBQ")
-"""An LZ4 frame's first fields: magic, flags, block size, size of the content."""
-_LZ4_MAGIC, _LZ4_HAS_CONTENT_SIZE = b"\x04\x22\x4d\x18", 0x08
 _PEEK_BYTES = 1 << 13
 
 _BLOCK_BYTES = 1 << 13
@@ -319,7 +315,8 @@ def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False
         raise DamageError("record-damaged")
     _refuse_unknown(codec)
     try:
-        if codec == "zstd" or (codec == "lz4" and (checked or _read_lz4_content_size(data) == size)):
+        # an LZ4 frame that is too short would leave what lay in memory before, unless a checksum shows that
+        if codec == "zstd" or (codec == "lz4" and checked):
             return memoryview(pa.decompress(pa.py_buffer(data), size, codec=codec)).cast("B")
         with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
             found = stream.read_buffer(size)
@@ -334,17 +331,6 @@ def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False
 def _refuse_unknown(codec: str) -> None:
     if codec not in ("lz4", "zstd", "bz2"):
         raise DamageError("chunk-damaged")
-
-
-def _read_lz4_content_size(frame: memoryview) -> int:
-    """Return what an LZ4 frame says of its content's size, which decompressing proves; -1 where it says nothing.
-
-    Without either this or a checksum, what a frame lacks of the size that a chunk claims would be whatever lay in
-    memory before.
-    """
-    if len(frame) < _LZ4_HEAD.size or frame[:4] != _LZ4_MAGIC or not frame[4] & _LZ4_HAS_CONTENT_SIZE:
-        return -1
-    return int(_LZ4_HEAD.unpack_from(frame)[3])
 
 
 def decompress_prefix(codec: str, data: memoryview, size: int) -> memoryview:

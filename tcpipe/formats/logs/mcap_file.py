@@ -176,7 +176,8 @@ class McapPart(ChunkedPart[Chunk]):
         regions: list[memoryview] = []
         places: list[tuple[int, int, int, int]] = []
         unsound, before = [], 0
-        self._bytes.expect([_find_needed_bytes(chunk) for chunk in chunks if chunk.index is not None])
+        starts = [(c.offset if c.compression else c.end, c) for c in chunks if c.index is not None]
+        self._bytes.expect([(start, c.end + c.index_bytes - start) for start, c in starts])  # of a plain one, indexes
         for number, chunk in enumerate(chunks):
             if chunk.index is None or chunk.cut or chunk.size > MAX_PLANNED_BYTES:
                 unsound.append(number)
@@ -203,13 +204,10 @@ class McapPart(ChunkedPart[Chunk]):
 
     def _index_entries(self, offset: int, channel: int) -> Ints:
         """Return a message index as (log time, offset), shape (N, 2)."""
-        return index_entries(self._index_record(offset), channel)
-
-    def _index_record(self, offset: int) -> memoryview:
         length = int.from_bytes(self._bytes.peek(offset, RECORD_HEAD)[1:], "little")
         if offset + RECORD_HEAD + length > self._bytes.size:
             raise DamageError("chunk-index-damaged")
-        return self._bytes.read(offset, RECORD_HEAD + length)
+        return index_entries(self._bytes.read(offset, RECORD_HEAD + length), channel)
 
     def _fill_gaps(self) -> None:
         """Walk what lies between the chunks that the summary names: message indexes, and messages outside chunks."""
@@ -251,7 +249,9 @@ class McapPart(ChunkedPart[Chunk]):
                 after = position + RECORD_HEAD + length
                 self._take_record(opcode, position, after, end)
             except DamageError as error:
-                after = self._stepped_over(position, end, error)
+                after = self._next_chunk(position + 1, end)
+                self._note(error.cause, position, bytes_lost=after - position, reason=error.reason)
+                self._distrust_last_index()
             position = after
         return False
 
@@ -270,13 +270,6 @@ class McapPart(ChunkedPart[Chunk]):
         size = after - position
         if size:
             self._contents.chunks.append(Chunk(position, position, size, "", size, 0, 0, headless=True))
-        return after
-
-    def _stepped_over(self, position: int, end: int, error: DamageError) -> int:
-        """Note what cannot be at ``position``; return where the next chunk begins."""
-        after = self._next_chunk(position + 1, end)
-        self._note(error.cause, position, bytes_lost=after - position, reason=error.reason)
-        self._distrust_last_index()
         return after
 
     def _take_record(self, opcode: int, position: int, after: int, end: int) -> None:
@@ -436,12 +429,6 @@ class McapPart(ChunkedPart[Chunk]):
             lost = 0
         size = chunk.uncompressed_bytes
         self._note(error.cause, chunk.offset, messages_lost=lost or None, bytes_lost=size, reason=error.reason)
-
-
-def _find_needed_bytes(chunk: Chunk) -> tuple[int, int]:
-    """Return the bytes (offset, size) to read of a chunk with wanted messages; of a plain chunk, first its indexes."""
-    start = chunk.offset if chunk.compression else chunk.end
-    return start, chunk.end + chunk.index_bytes - start
 
 
 def _find_possible_chunks(block: memoryview, size: int) -> list[int]:
