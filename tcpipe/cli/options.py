@@ -114,15 +114,13 @@ def _store(context: click.Context) -> Store | None:
     return None if "://" in place else Store(Path(place))
 
 
-def _list_runs(store: Store) -> Iterable[str]:
-    return sorted({run.run_id for run in store.scan().runs.values()})
-
-
 complete_robots = _complete_names(_list_robots)
 """Offers the robots that the recipe knows."""
 complete_scenarios = _complete_names(lambda _: import_module("tcpipe.simulation.scenarios").SCENARIOS)
 """Offers the sites that can be simulated."""
-complete_runs = _complete_names(lambda context: _list_runs(store) if (store := _store(context)) else ())
+complete_runs = _complete_names(
+    lambda context: sorted({run.run_id for run in store.scan().runs.values()}) if (store := _store(context)) else ()
+)
 """Offers the store's runs."""
 complete_maps = _complete_names(lambda context: store.scan().maps if (store := _store(context)) else ())
 """Offers the store's maps."""

@@ -91,13 +91,10 @@ def report_errors(own: OwnKind | str | None) -> Iterator[None]:
             raise
         frames = traceback.extract_tb(error.__traceback__)
         package = str(Path(__file__).parents[1])
-        in_file = next((frame for frame in reversed(frames) if Path(frame.filename).name == _file_name(source)), None)
+        file_name = Path(source if source.endswith(".py") else source.rpartition(":")[0]).name
+        in_file = next((frame for frame in reversed(frames) if Path(frame.filename).name == file_name), None)
         at = in_file or next(
             (frame for frame in reversed(frames) if not frame.filename.startswith(package)), frames[-1]
         )
         where = f"{at.filename}, line {at.lineno}, in {at.name}"
         raise ModelError(f"--predictor {source}: {type(error).__name__}: {error} ({where})") from error
-
-
-def _file_name(source: str) -> str:
-    return Path(source if source.endswith(".py") else source.rpartition(":")[0]).name

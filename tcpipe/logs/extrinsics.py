@@ -63,13 +63,9 @@ def build_static_tree(transforms: Sequence[Transforms]) -> Tree:
     for (parent, child), pose in first.items():
         if (parent, child) not in moving:
             tree.setdefault(parent, {})[child] = pose
-            tree.setdefault(child, {})[parent] = _invert_pose(pose)
+            parent_from_child = invert(pose.quat_xyzw)
+            tree.setdefault(child, {})[parent] = Pose(-rotate(parent_from_child, pose.xyz_m), parent_from_child)
     return tree
-
-
-def _invert_pose(a_from_b: Pose) -> Pose:
-    b_from_a = invert(a_from_b.quat_xyzw)
-    return Pose(-rotate(b_from_a, a_from_b.xyz_m), b_from_a)
 
 
 def _chain_poses(a_from_b: Pose, b_from_c: Pose) -> Pose:

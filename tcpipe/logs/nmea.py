@@ -13,6 +13,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import xor
 
 import numpy as np
 
@@ -95,7 +97,7 @@ def _read(
 
 
 def _split_fields(body: str, checksum: str | None) -> list[str]:
-    if checksum is not None and int(checksum, 16) != _compute_checksum(body):
+    if checksum is not None and int(checksum, 16) != reduce(xor, body.encode("utf-8", "replace"), 0):
         raise ValueError(checksum)
     return body.split(",")
 
@@ -138,13 +140,6 @@ def _parse_number(text: str) -> float:
     if abs(value) > _VAST:
         raise ValueError(text)
     return value
-
-
-def _compute_checksum(body: str) -> int:
-    total = 0
-    for byte in body.encode("utf-8", "replace"):
-        total ^= byte
-    return total
 
 
 def _parse_degrees(text: str, degree_digits: int) -> float:

@@ -192,7 +192,10 @@ def assign_roles(
     elif "gnss_velocity" in decided.roles and "gnss" not in decided.roles:
         decided.problems.append(f"recipe read.topics.gnss_velocity: {_NO_FIXES}")
     no_motion, proposed = _find_no_motion(decided, list(listed.values()))
-    problems = decided.problems + (no_motion or _list_questions(decided))
+    lines = [_format_recipe_line(role, names) for role, names in decided.choices.items()]
+    head = RecipeFragment({"read.topics": {}}).toml()
+    how = ["decide in the recipe (tcpipe.toml), for example:", head, *lines] if decided.ambiguous else []
+    problems = decided.problems + (no_motion or [*decided.ambiguous, *how])
     return RoleAssignment(
         name,
         robot_why,
@@ -559,13 +562,6 @@ def _format_recipe_line(role: str, names: Sequence[str]) -> str:
     several = f", or {how}: [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in names)}]"
     line = RecipeFragment({"read.topics": {role: [names[0]]}}).toml().splitlines()[-1]
     return f"{line}  #{others}{several}"
-
-
-def _list_questions(decided: _Decisions) -> list[str]:
-    head = RecipeFragment({"read.topics": {}}).toml()
-    lines = (_format_recipe_line(role, names) for role, names in decided.choices.items())
-    how = ["decide in the recipe (tcpipe.toml), for example:", head, *lines]
-    return [*decided.ambiguous, *how] if decided.ambiguous else []
 
 
 def _find_no_motion(decided: _Decisions, topics: Sequence[Topic]) -> tuple[list[str], list[Finding]]:

@@ -267,7 +267,11 @@ def walk(message: Record, data: Bytes, starts: Ints, ends: Ints, dialect: Dialec
     fits = np.ones(len(starts), bool)
     while fits.any():
         bases, sizes = starts[fits] + dialect.origin, ends[fits] - starts[fits] - dialect.origin
-        cursors = _Cursors(data, _find_grid(bases, sizes), sizes, dialect)
+        steps = np.diff(bases)
+        places: Places = bases
+        if (sizes == sizes[0]).all() and (steps == steps[:1]).all():  # at equal distances
+            places = Grid(int(bases[0]), (len(bases),), (int(steps[0]) if len(steps) else 1,))
+        cursors = _Cursors(data, places, sizes, dialect)
         try:
             root = cursors.record(message, np.arange(len(sizes)))
         except LayoutError:  # which stands for all of them
@@ -277,14 +281,6 @@ def walk(message: Record, data: Bytes, starts: Ints, ends: Ints, dialect: Dialec
             return WalkResult(root, fits)
         fits[fits] = good
     return WalkResult(None, np.zeros(len(starts), bool))
-
-
-def _find_grid(bases: Ints, sizes: Ints) -> Places:
-    """Return bases as a grid where messages of one size lie at equal distances."""
-    steps = np.diff(bases)
-    if (sizes != sizes[0]).any() or (steps != steps[:1]).any():
-        return bases
-    return Grid(int(bases[0]), (len(bases),), (int(steps[0]) if len(steps) else 1,))
 
 
 class _Cursors:

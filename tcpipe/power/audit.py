@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.power.rails import Rail, interpolate_rail
@@ -105,15 +106,8 @@ def measure_sag(rails: Sequence[Rail]) -> Sag | None:
         return None
     volt, amp = np.mean([value[0] for value in values], axis=0), np.sum([value[1] for value in values], axis=0)
     rows = max(round(_WINDOW_S * 1e9 / float(np.median(np.diff(stamp_ns)))), 3)
-    volt, amp = (signal - _compute_moving_mean(signal, rows) for signal in (volt, amp))
+    volt, amp = (signal - uniform_filter1d(signal, rows, mode="nearest") for signal in (volt, amp))
     return Sag(stamp_ns, volt, amp, 0.5 * (np.roll(amp, 1) + np.roll(amp, -1)))
-
-
-def _compute_moving_mean(values: Floats, rows: int) -> Floats:
-    """Return the mean over so many rows around each, the ends repeated."""
-    padded = np.pad(values, (rows // 2 + 1, rows - rows // 2 - 1), mode="edge")
-    total = np.cumsum(padded)
-    return (total[rows:] - total[:-rows]) / rows
 
 
 @dataclass(frozen=True, slots=True)

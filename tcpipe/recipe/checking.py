@@ -148,16 +148,13 @@ def as_toml(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(as_toml(item) for item in value) + "]"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_make_key(str(name))} = {as_toml(item)}" for name, item in value.items()) + "}"
+        keys = ((str(name) if _BARE_KEY.fullmatch(str(name)) else as_toml(str(name)), value[name]) for name in value)
+        return "{" + ", ".join(f"{key} = {as_toml(item)}" for key, item in keys) + "}"
     if is_dataclass(value) and not isinstance(value, type):
         return as_toml({name: item for name, item in asdict(value).items() if item is not None})
     if isinstance(value, int) and value.bit_length() > _DECIMAL_BITS:
         return hex(value)
     return repr(value)
-
-
-def _make_key(name: str) -> str:
-    return name if _BARE_KEY.fullmatch(name) else as_toml(name)
 
 
 def parse_utc_ns(text: str) -> int:

@@ -142,7 +142,7 @@ class TilePool:
                 self._held.move_to_end(tile)
         self._grow(len(wanted))
         for tile in absent:
-            if len(self._held) < self._room():
+            if len(self._held) < self._flat["relative"].shape[1] // self._map.tile_px**2:
                 slot = len(self._held)
             else:
                 gone, slot = self._held.popitem(last=False)
@@ -150,9 +150,6 @@ class TilePool:
             self._read(tile, slot)
             self._held[tile] = slot
             self.slots[tile] = slot
-
-    def _room(self) -> int:
-        return int(self._flat["relative"].shape[1]) // self._map.tile_px**2
 
     def _grow(self, tiles: int) -> None:
         """Make room for so many tiles."""

@@ -117,7 +117,15 @@ def build_map(
         others = [rasters[role].georeference for role in ("ortho", "terrain") if role in rasters]
         grid = choose_grid(ground, others, map_crs, pixel_size_m)
         sources: dict[str, LayerSource] = {
-            role: _make_source(raster, schemes, grid, map_crs) for role, raster in rasters.items()
+            role: RasterLayer(
+                _make_layer(raster, schemes),
+                raster,
+                grid,
+                find_projection(raster.georeference, map_crs),
+                schemes.get(role),
+                Tally(nodata=raster.tiles[0].nodata),
+            )
+            for role, raster in rasters.items()
         }
         if drawn:
             sources["terrain"] = place_polygons(drawn, scheme, map_crs, grid)
@@ -125,7 +133,10 @@ def build_map(
         with write_atomic_directory(out_path) as half:
             writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=layers)
             for source in sources.values():
-                _write(writer, source)
+                for row0, col0, rows, cols in iterate_shards(source.grid, SHARD_PX):
+                    shard = source.shard(row0, col0, rows, cols)
+                    if source.tally.count(source.layer, source.label, shard):
+                        writer.write(source.layer.name, row0, col0, shard)
             _refuse_empty(sources)
             facts = _make_facts(grid, sources, origin, inputs or MapInputs())
             photo = sources.get("ortho")
@@ -134,12 +145,6 @@ def build_map(
             writer.finish(facts, {role: _set_range(source) for role, source in sources.items()})
             write_checksums(half)
     return facts
-
-
-def _make_source(raster: Raster, schemes: Mapping[str, ClassScheme], grid: MapGrid, crs: CRS) -> RasterLayer:
-    """Return a raster as a layer."""
-    projection, tally = find_projection(raster.georeference, crs), Tally(nodata=raster.tiles[0].nodata)
-    return RasterLayer(_make_layer(raster, schemes), raster, grid, projection, schemes.get(raster.role), tally)
 
 
 def _make_layer(raster: Raster, schemes: Mapping[str, ClassScheme]) -> Layer:
@@ -155,13 +160,6 @@ def _set_range(source: LayerSource) -> Layer:
     """Return a layer with the range of its values, as it was found."""
     layer, tally = source.layer, source.tally
     return replace(layer, low=tally.low, high=tally.high) if layer.stack == "floats" else layer
-
-
-def _write(writer: MapWriter, source: LayerSource) -> None:
-    for row0, col0, rows, cols in iterate_shards(source.grid, SHARD_PX):
-        shard = source.shard(row0, col0, rows, cols)
-        if source.tally.count(source.layer, source.label, shard):
-            writer.write(source.layer.name, row0, col0, shard)
 
 
 def _read_own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[str, ClassScheme]:

@@ -177,17 +177,17 @@ class RouteGraph:
         ways = dict.fromkeys((edge.start, edge.end) for edge in self.edges)
         back = [(b, a) for a, b in ways if (b, a) not in ways]
         first = 1 + max([*self.nodes, *(edge.edge_id for edge in self.edges)], default=-1)
-        return [_make_edge(first + number, a, b, self.nodes) for number, (a, b) in enumerate(back)]
+        made = list[RouteEdge]()
+        for edge_id, (start, end) in enumerate(back, first):
+            geometry: Json = {"type": "LineString", "coordinates": [self.nodes[start], self.nodes[end]]}
+            properties: Json = {"id": edge_id, "startid": start, "endid": end}
+            document = {"type": "Feature", "properties": properties, "geometry": geometry}
+            made.append(RouteEdge(edge_id, start, end, document))
+        return made
 
     def make_document(self, edges: Sequence[Mapping[str, Json]]) -> dict[str, Json]:
         """Return the file with other edges."""
         return {**self.document, "features": [*self.others, *edges]}
-
-
-def _make_edge(edge_id: int, start: int, end: int, nodes: Mapping[int, tuple[float, float]]) -> RouteEdge:
-    geometry: Json = {"type": "LineString", "coordinates": [nodes[start], nodes[end]]}
-    properties: Json = {"id": edge_id, "startid": start, "endid": end}
-    return RouteEdge(edge_id, start, end, {"type": "Feature", "properties": properties, "geometry": geometry})
 
 
 def read_route_graph(path: Path) -> RouteGraph:

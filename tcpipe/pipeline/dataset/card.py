@@ -31,7 +31,6 @@ from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.inputs import ChosenInputs
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.power.witnesses import compare_batteries
-from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.stages.label import make_fit_samples
@@ -93,6 +92,8 @@ def make_dataset_card(
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
     runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
     folds = samples.column("fold").filter(pc.equal(samples.column("split"), "train"))
+    powers = (run.manifest.info.report.facts.power for run in inputs.runs)
+    includes = tuple(sorted({load for power in powers if power is not None for load in power.includes}))
     card = DatasetCard(
         data_model_version=DATA_MODEL_VERSION,
         tcpipe_version=__version__,
@@ -114,7 +115,7 @@ def make_dataset_card(
         layers={name: describe_layer(layer) for name, layer in layers.items()},
         tensor=_describe_tensor(layers, classes) if layers else {},
         classes=classes.classes if has_terrain else (),
-        label=_label(recipe, inputs),
+        label=LabelColumns(("power_watt", VELOCITY_COLUMN[recipe.label.velocity]), recipe.label.velocity, includes),
         labels={name: int(np.isfinite(to_floats(samples, column)).sum()) for name, column in LABELS.items()},
         plane="" if content.sources else content.plane,
         energy_budget=pool_budgets(run.energy_budget for run in inputs.sources),
@@ -132,13 +133,6 @@ def make_dataset_card(
     )
     findings = tuple(dict.fromkeys((*content.findings, *find_in_samples(card))))
     return replace(card, findings=findings, verdict=judge_dataset(findings, card.runs, card.maps))
-
-
-def _label(recipe: Recipe, inputs: ChosenInputs) -> LabelColumns:
-    powers = (run.manifest.info.report.facts.power for run in inputs.runs)
-    includes = tuple(sorted({load for power in powers if power is not None for load in power.includes}))
-    velocity = recipe.label.velocity
-    return LabelColumns(("power_watt", VELOCITY_COLUMN[velocity]), velocity, includes)
 
 
 def _describe_tensor(layers: Mapping[str, Layer], classes: ClassTable) -> dict[str, str | tuple[str, ...]]:
