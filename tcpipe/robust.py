@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-
-from tcpipe.arrays import Floats
+from numpy.typing import NDArray
 
 NORMAL_MEDIAN = 0.6744897501960817
 """Median of the absolute value of a normal variate of unit variance."""
@@ -14,12 +13,12 @@ MEDIAN_OF_SQUARES = NORMAL_MEDIAN**2
 """Median of its square."""
 
 
-def estimate_robust_std(residuals: Floats) -> float:
+def estimate_robust_std(residuals: NDArray[np.float64]) -> float:
     """Return σ of residuals about zero: that of the normal distribution with the same median absolute value."""
     return float(np.median(np.abs(residuals))) / NORMAL_MEDIAN
 
 
-def estimate_shorth(values: Floats) -> tuple[float, float]:
+def estimate_shorth(values: NDArray[np.float64]) -> tuple[float, float]:
     """Return centre and σ of finite values by their shortest half, for few: Rousseeuw and Leroy (1987); none: 0, 0."""
     rising = np.sort(values[np.isfinite(values)])
     if not rising.size:
