@@ -42,7 +42,6 @@ from tcpipe.fusion.measurements import (
     IMU,
     NO_LEVER_ARM,
     NO_TRUST,
-    STATED_ARM_STD_M,
     UNSTATED_ARM_STD_M,
     WHEELS,
     InitialState,
@@ -51,7 +50,7 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, find_walk, make_model, make_priors, make_start, widen_start
-from tcpipe.fusion.process import GROUND, SLOPE_RAD, UNSEEN_TURN_RADPS, find_best_scale_std, is_length_observable
+from tcpipe.fusion.process import find_best_scale_std, is_length_observable
 from tcpipe.fusion.smoother_kernel import LARGEST_EVENT, SELDOM, Candidates, Smoothed, make_adjoint, smooth_ticks
 from tcpipe.fusion.state import Error, Kind
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
@@ -283,31 +282,31 @@ def _list_blocks(size: int) -> list[tuple[int, int]]:
 def filter_section(ticks: Ticks, model: FilterModel, start: Memory, *, until: int | None = None) -> Pass:
     """Return the forward pass from a start, over all ticks or those before ``until``."""
     size = min(until or ticks.stamp_ns.size, ticks.stamp_ns.size)
-    made = Pass(ticks, model, [], make_tests(size), np.zeros((size, state.NX)), start.copy())
+    made = Pass(ticks, model, [], make_tests(size), start.copy())
     empty = allocate_steps(0, model.active.size)
     for first, last in _list_blocks(size):
         made.checkpoints.append(made.last.copy())
-        filter_ticks(first, last, ticks.inputs, model, made.last, False, empty, made.tests, made.states)
+        filter_ticks(first, last, ticks.inputs, model, made.last, empty, made.tests)
     return made
 
 
 def smooth_section(made: Pass, *, with_displacements: bool = True) -> tuple[Smoothed, tuple[Change, ...]]:
     """Return the smoothed estimate of a forward pass, and events worth more than their cost, the most likely first."""
-    size, n = made.states.shape[0], made.model.active.size
+    size, n = len(made.tests.nis), made.model.active.size
     lags = np.array([round(lag_s / made.ticks.inputs.period_s) for lag_s in DISPLACEMENT_LAGS_S])
     adjoint = make_adjoint(n, int(lags.max()) if with_displacements else 0)
     possible, candidates = _list_candidates(made)
     out = Smoothed(
-        np.zeros_like(made.states),
+        np.zeros((size, state.NX)),
         np.zeros((size, 5)),
         np.full((size, lags.size), np.nan),
         np.zeros((-(-size // SELDOM), n)),
     )
-    steps, again, filtered = allocate_steps(min(size, _BLOCK), n), make_tests(size), np.zeros_like(made.states)
+    steps = allocate_steps(min(size, _BLOCK), n)
     for (first, last), memory in zip(reversed(_list_blocks(size)), reversed(made.checkpoints), strict=True):
         steps.used[:] = False
-        filter_ticks(first, last, made.ticks.inputs, made.model, memory.copy(), True, steps, again, filtered)
-        smooth_ticks(first, last, made.ticks.inputs, made.model, steps, filtered, lags, adjoint, candidates, out)
+        filter_ticks(first, last, made.ticks.inputs, made.model, memory.copy(), steps, made.tests)
+        smooth_ticks(first, last, made.ticks.inputs, made.model, steps, lags, adjoint, candidates, out)
     gains = candidates.best[:, 0] - np.array([EVENTS[key].cost for key in possible])
     events = []
     for row in np.argsort(-gains, kind="stable"):
@@ -346,22 +345,13 @@ def make_trajectory(
     """Return the trajectory at the wanted stamps [ns]; its standard deviations include errors outside the filter."""
     m, noise, std, ticks = section.measurements, section.noise, section.std, made.ticks
     at = np.searchsorted(ticks.stamp_ns, output_ns)
-    x, variances = smoothed.states[at], smoothed.variances[at]
-    rotation, velocity, rate = _make_motion(x, ticks, at)
-    position, yaw_variance = x[:, 9:12].copy(), variances[:, 3]
-    position_variance, speed_variance = variances[:, :3].copy(), variances[:, 4].copy()
+    rotation, velocity, rate = _make_motion(smoothed.states, ticks, at)
+    position, variances = smoothed.states[at, 9:12], smoothed.variances[at]
+    position_variance, yaw_variance, speed_variance = variances[:, :3], variances[:, 3], variances[:, 4]
     speed = np.linalg.norm(velocity, axis=1)
     links = _interpolate_links(smoothed, at, output_ns)
     if m.gnss is not None and not m.gnss.has_heights:
         position_variance[:, 2] += NO_TRUST
-    if m.gnss is not None and not m.has_absolute_tilt:
-        # On slopes that nothing measures an antenna of unknown height moves sideways.
-        height_m2 = max(0.0, m.gnss.lever_arm_std_m[2] ** 2 - STATED_ARM_STD_M[2] ** 2)
-        height_m2 += m.is_antenna_alone * m.gnss.lever_arm_m[2] ** 2
-        slope_variance = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2.0 * SLOPE_RAD**2)
-        links = links + slope_variance * height_m2
-        if m.has_tilt:  # noise of the camera's roll looks like another height: its stated uncertainty stays
-            position_variance += m.gnss.lever_arm_std_m[2] ** 2 * rotation[:, :, 2] ** 2
     if m.gnss is not None and m.is_antenna_alone:  # level, and along the course
         antenna = np.asarray(m.gnss.lever_arm_m)
         yaw = compute_course(velocity)
@@ -371,7 +361,6 @@ def make_trajectory(
         yaw_variance = (np.pi / np.sqrt(3.0)) ** 2 * speed_variance / (speed_variance + speed**2)
         position -= rotation @ antenna
         position_variance[:, :2] += (yaw_variance * np.sum(antenna[:2] ** 2))[:, None]
-        speed_variance += (UNSEEN_TURN_RADPS * antenna[2]) ** 2
     is_open = m.odometries() and not is_length_observable(m, noise.horizontal)
     scale_std = find_best_scale_std(m) if is_open else 0.0
     if m.gnss is None:
@@ -394,13 +383,13 @@ def make_trajectory(
 
 def _make_motion(x: Floats, ticks: Ticks, at: Ints) -> tuple[Floats, Floats, Floats]:
     """Return attitude (N, 3, 3), velocity in ENU [m/s] and angular velocity in robot axes [rad/s], shapes (N, 3)."""
-    imu = x[:, :9].reshape(-1, 3, 3)
-    mount = x[:, Error.MOUNT + 6 : Error.MOUNT + 9]
+    imu = x[at, :9].reshape(-1, 3, 3)
+    mount = x[at, Error.MOUNT + 6 : Error.MOUNT + 9]
     rotation = imu + np.cross(imu, mount[:, None])  # a small turn
     rotation = matrix_from_quat(quat_from_matrix(rotation)) if mount.any() else imu
-    velocity = np.einsum("nij,nj->ni", imu, x[:, Error.U + 6 : Error.U + 9])
+    velocity = np.einsum("nij,nj->ni", imu, x[at, Error.U + 6 : Error.U + 9])
     gyro = ticks.inputs.has_gyro[at, None]
-    bias, scale = x[:, Error.GYRO_BIAS + 6 : Error.GYRO_BIAS + 9], x[:, Error.TURN_SCALE + 6, None]
+    bias, scale = x[at, Error.GYRO_BIAS + 6 : Error.GYRO_BIAS + 9], x[at, Error.TURN_SCALE + 6, None]
     rate = (ticks.inputs.rate[at] - np.where(gyro, bias, 0.0)) * (1.0 - scale)
     return rotation, velocity, rate - np.cross(mount, rate)
 
@@ -426,7 +415,7 @@ def _list_rows(m: Measurements, made: Pass) -> Mapping[int, tuple[Ints, Ints]]:
     for kind, role in ROLES.items():
         if role in sensors and kind in made.ticks.rows:
             ticks = made.ticks.rows[kind]
-            inside = (ticks >= 0) & (ticks < made.states.shape[0])
+            inside = (ticks >= 0) & (ticks < len(made.tests.nis))
             found[kind] = sensors[role].stamp_ns[inside], ticks[inside]
     return found
 
@@ -459,7 +448,7 @@ def _find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
 def _list_changes(made: Pass, smoothed: Smoothed, explained: Hypothesis) -> Iterator[ChangeFacts]:
     """Yield the changes that explain the run best."""
     for change in explained.changes:
-        last, size, role = change.last or made.states.shape[0] - 1, change.size, ROLES[change.role]
+        last, size, role = change.last or len(made.tests.nis) - 1, change.size, ROLES[change.role]
         if change.kind == "varies":
             places = (
                 (Error.WHEEL_SCALE, Error.WHEEL_SLIP) if role == WHEELS else (Error.VISUAL_SCALE, Error.VISUAL_SLIP)

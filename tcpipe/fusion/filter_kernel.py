@@ -133,7 +133,7 @@ class Memory(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Inputs of the smoother for B ticks: motion F, kept shares, updates by kind (K, H, S⁻¹ y, S⁻¹, turn), last P."""
+    """Inputs of the smoother for B ticks: motion F, kept shares, updates by kind (K, H, S⁻¹ y, S⁻¹, turn), last x, P."""
 
     F: NDArray[np.float64]
     kept: Matrix
@@ -143,6 +143,7 @@ class Steps(NamedTuple):
     pull: NDArray[np.float64]
     inverse: NDArray[np.float64]
     turn: NDArray[np.float64]
+    x: Matrix
     P: NDArray[np.float64]
 
 
@@ -171,6 +172,7 @@ def allocate_steps(ticks: int, n: int) -> Steps:
         np.zeros((ticks, KINDS, 3)),
         np.zeros((ticks, KINDS, 3, 3)),
         np.zeros((ticks, KINDS, 18)),
+        np.zeros((ticks, NX)),
         np.zeros((ticks, n, n)),
     )
 
@@ -445,10 +447,8 @@ def filter_ticks(
     inputs: TickInputs,
     model: FilterModel,
     memory: Memory,
-    keep: bool,
     steps: Steps,
     tests: Tests,
-    states: Matrix,
 ) -> None:
     """Filter ticks ``first`` to ``last``, the latter excluded; ``memory`` becomes that after them.
 
@@ -456,10 +456,11 @@ def filter_ticks(
     ----------
     inputs, model : see there.
     memory : state before ``first``: at tick ``first - 1``, or at ``first`` where that is 0.
-    keep : whether ``steps`` is filled; tick k has row ``k - first``.
-    tests, states : filled for these ticks; states are x after the measurements of each, shape (K, 51).
+    steps : filled, unless there is room for none; tick k has row ``k - first``.
+    tests : filled for these ticks.
     """
     x, P, waits = memory
+    keep = steps.used.shape[0] > 0
     n = P.shape[0]
     room = (
         np.zeros((n, n)),
@@ -523,6 +524,5 @@ def filter_ticks(
                     for b in range(size):
                         s += inverse[a, b] * y[b]
                     steps.pull[row, kind, a] = s
-        states[k] = x
         if keep:
-            steps.P[k - first] = P
+            steps.x[k - first], steps.P[k - first] = x, P

@@ -17,7 +17,7 @@ from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory
 from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements, Positions
-from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, is_length_observable, turn_scale_std
+from tcpipe.fusion.process import find_scale_stds, is_length_observable, turn_scale_std
 from tcpipe.fusion.state import Error, Kind, Mode
 from tcpipe.fusion.ticks import Ticks
 from tcpipe.geometry.rotation import matrix_from_quat
@@ -115,7 +115,7 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     if m.gnss is not None:
         if wanted["lag of fixes"]:
             std[Error.FIX_LAG] = m.gnss.lag_std_s
-        std[Error.ARM : Error.FIX_LAG] = m.gnss.lever_arm_std_m if m.has_tilt else 0.0
+        std[Error.ARM : Error.FIX_LAG] = np.where(_find_arm_axes(m), m.gnss.lever_arm_std_m, 0.0)
         std[Error.FIX_OFFSET : Error.FIX_OFFSET + 3] = _find_lasting_std_m(m.gnss, m, noise)
         std[Error.POSE_MOUNT : Error.POSE_MOUNT + 3] = m.gnss.mounting_std_rad if m.has_attitude else 0.0
         std[Error.FIX_ERROR : Error.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
@@ -126,14 +126,16 @@ def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> 
     """Return the standard deviation of what fixes err throughout the section [m], shape (3,).
 
     That is what fixes claim beyond the errors that the section shows; without tilt also the antenna's place, since an
-    antenna that sways looks like one elsewhere, and without heights, which show slopes, the sway.
+    antenna that sways looks like one elsewhere.
     """
     axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
     variance = np.array([max(0.0, fix.claimed_m2 - fix.white - fix.correlated.variance) for fix in axes])
-    if not m.has_tilt:
-        variance += np.square(gnss.lever_arm_std_m)
-        variance[:2] += (m.is_antenna_alone or not gnss.has_heights) * (SLOPE_RAD * gnss.lever_arm_m[2]) ** 2
-    return np.asarray(np.sqrt(variance))
+    return np.asarray(np.sqrt(variance + np.where(_find_arm_axes(m), 0.0, np.square(gnss.lever_arm_std_m))))
+
+
+def _find_arm_axes(m: Measurements) -> tuple[bool, bool, bool]:
+    """Return the axes along which tilt shows where the antenna is; noise of a camera's roll looks like another height."""
+    return m.has_tilt, m.has_tilt, m.has_absolute_tilt
 
 
 def find_walk(process: GaussMarkov) -> float:

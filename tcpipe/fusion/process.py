@@ -43,7 +43,6 @@ _TURN_SCALE_STD: Mapping[str, float] = {
     VISUAL: 0.03,  # camera
 }
 """σ of the scale of a turn rate [1]."""
-SLOPE_RAD = 0.1  # slope of unknown ground [rad], 1σ
 UNSEEN_TURN_RADPS = 0.07  # roll and pitch rate on uneven ground [rad/s], 1σ
 GROUND = 2e-3  # density of the change of slope under a robot [rad²/m]: 2.6° over a metre
 _ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration [s]: one row

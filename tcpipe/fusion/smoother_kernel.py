@@ -331,7 +331,6 @@ def smooth_ticks(
     inputs: TickInputs,
     model: FilterModel,
     steps: Steps,
-    states: Matrix,
     lags: Indices,
     adjoint: Adjoint,
     candidates: Candidates,
@@ -341,7 +340,7 @@ def smooth_ticks(
 
     Parameters
     ----------
-    steps, states : of these ticks, as `filter_ticks` filled them.
+    steps : of these ticks, as `filter_ticks` filled them.
     lags : ticks over which displacements are wanted.
     adjoint : of tick ``last`` before its motion; becomes that of ``first`` before its motion.
     candidates : events to be scored at these ticks.
@@ -353,7 +352,7 @@ def smooth_ticks(
     C, L = np.zeros((LARGEST_EVENT, LARGEST_EVENT + 1)), np.zeros((LARGEST_EVENT, LARGEST_EVENT))
     for k in range(last - 1, first - 1, -1):
         row = k - first
-        _smooth_tick(k, steps.P[row], states[k], model, adjoint, lags, out, A, room)
+        _smooth_tick(k, steps.P[row], steps.x[row], model, adjoint, lags, out, A, room)
         for kind in range(KINDS - 1, -1, -1):
             if steps.used[row, kind]:
                 step_before_update(

@@ -62,13 +62,12 @@ class Ticks:
 
 @dataclass(slots=True)
 class Pass:
-    """One forward pass over a section: its model, checkpoints, tests, and filtered states by tick."""
+    """One forward pass over a section: its model, checkpoints and tests by tick."""
 
     ticks: Ticks
     model: FilterModel
     checkpoints: list[Memory]
     tests: Tests
-    states: Floats
     last: Memory
 
 

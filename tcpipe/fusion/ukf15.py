@@ -86,7 +86,7 @@ def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pas
         if k % SELDOM == 0:
             spreads[k // SELDOM] = np.sqrt(np.diag(ukf.covariance))
     no_links = np.full((size, len(DISPLACEMENT_LAGS_S)), np.nan)
-    return Pass(ticks, model, [], tests, states, start), Smoothed(states, variances, no_links, spreads)
+    return Pass(ticks, model, [], tests, start), Smoothed(states, variances, no_links, spreads)
 
 
 class _Filter:

@@ -97,9 +97,9 @@ def model_of(free, *, walk=0.0):
 def filter_all(inputs, model, memory):
     """Return what each tick keeps for the smoother, and the states."""
     count = inputs.mode.size
-    steps, states = allocate_steps(count, model.active.size), np.zeros((count, state.NX))
-    filter_ticks(0, count, inputs, model, memory, True, steps, make_tests(count), states)
-    return steps, states
+    steps = allocate_steps(count, model.active.size)
+    filter_ticks(0, count, inputs, model, memory, steps, make_tests(count))
+    return steps, steps.x
 
 
 def differentiate(function, count, step=1e-6):
@@ -172,9 +172,9 @@ def test_a_wide_covariance_passes_as_a_cloud_does():
     P = np.diag([1e-8, 1e-8, np.radians(20.0) ** 2, *[1e-8] * 6])
     inputs.value[0, Kind.FIX], inputs.variance[0, Kind.FIX] = 0.0, 1e-4
     inputs.tau[:], inputs.rate[:], inputs.acceleration[:] = 0.0, 0.0, 0.0
-    tests, states = make_tests(1), np.zeros((1, state.NX))
+    tests = make_tests(1)
     memory = Memory(x.copy(), P.copy(), np.zeros((state.KINDS, 2)))
-    filter_ticks(0, 1, inputs, model, memory, False, allocate_steps(0, 9), tests, states)
+    filter_ticks(0, 1, inputs, model, memory, allocate_steps(0, 9), tests)
     yaw = np.radians(20.0) * rng.normal(size=400_000)
     cloud = 2.0 * np.stack((np.cos(yaw) - 1.0, np.sin(yaw)), -1)
     second = cloud.T @ cloud / yaw.size + np.eye(2) * 1e-4
@@ -360,22 +360,19 @@ def test_evidence_of_an_event_is_what_it_gains_in_log_likelihood(place):
 
     def filter_with(model):
         steps, tests = allocate_steps(size, model.active.size), make_tests(size)
-        memory, states = (
-            Memory(problem.x.copy(), problem.P.copy(), np.zeros((state.KINDS, 2))),
-            np.zeros((size, state.NX)),
-        )
-        filter_ticks(0, size, problem.inputs, model, memory, True, steps, tests, states)
-        return steps, states, -0.5 * np.nansum(tests.nis + tests.log_det)
+        memory = Memory(problem.x.copy(), problem.P.copy(), np.zeros((state.KINDS, 2)))
+        filter_ticks(0, size, problem.inputs, model, memory, steps, tests)
+        return steps, -0.5 * np.nansum(tests.nis + tests.log_det)
 
-    steps, states, likelihood = filter_with(problem.model)
+    steps, likelihood = filter_with(problem.model)
     row, best = (np.full((1, 9), value) for value in (entry, std)), np.full((1, 20), -np.inf)
     candidates = Candidates(*row, np.ones(1, np.int64), 1, best)
     empty = Smoothed(*(np.zeros((size, width)) for width in (state.NX, 5, 1, problem.model.active.size)))
     adjoint = make_adjoint(problem.model.active.size, 0)
-    smooth_ticks(0, size, problem.inputs, problem.model, steps, states, np.array([10]), adjoint, candidates, empty)
+    smooth_ticks(0, size, problem.inputs, problem.model, steps, np.array([10]), adjoint, candidates, empty)
     evidence, tick = best[0, :2]
     event = np.array([[int(tick), entry, 0]])
-    changed = filter_with(problem.model._replace(events=event, sizes=np.array([std**2]), shifts=np.zeros(1)))[2]
+    changed = filter_with(problem.model._replace(events=event, sizes=np.array([std**2]), shifts=np.zeros(1)))[1]
     assert evidence == pytest.approx(changed - likelihood, rel=0.05, abs=0.02)
 
 
@@ -391,10 +388,9 @@ def filter_stationary(kind, displace, noise):
     model.patience_s[kind] = 2.0
     x = np.zeros(state.NX)
     x[:9] = np.eye(3).ravel()
-    tests, states = make_tests(120), np.zeros((120, state.NX))
-    memory = Memory(x, np.eye(9) * 1e-4, np.zeros((state.KINDS, 2)))
-    filter_ticks(0, 120, inputs, model, memory, False, allocate_steps(0, 9), tests, states)
-    return tests, states
+    tests, steps = make_tests(120), allocate_steps(120, 9)
+    filter_ticks(0, 120, inputs, model, Memory(x, np.eye(9) * 1e-4, np.zeros((state.KINDS, 2))), steps, tests)
+    return tests, steps.x
 
 
 def test_rejections_in_a_row_open_the_gate_again():
