@@ -5,8 +5,6 @@ The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dat
 ``__init__.pyi`` gives editors and type checkers the module of each.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

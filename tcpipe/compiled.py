@@ -5,8 +5,6 @@ If an installation is read-only and has no home directory, the cache is a tempor
 kernel's own file with its cache; tcpipe also compares what this file imports.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import os

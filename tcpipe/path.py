@@ -8,8 +8,6 @@ recovers the straight metres behind a bend. The remainder at the end, shorter th
 Also: cutting a planned line by chord.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Progress as log records, so that worker processes and clusters forward it with their other records."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager

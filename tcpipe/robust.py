@@ -1,7 +1,5 @@
 """Scatter by medians, which outliers do not move."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

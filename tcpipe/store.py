@@ -9,8 +9,6 @@
       index.parquet            cache of what the documents say
 """
 
-from __future__ import annotations
-
 import re
 from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Share of labels or drives inside their prediction intervals, and whether the intervals are too narrow or wide."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -15,8 +15,6 @@ the idle power. It has separate columns, since it adds up linearly over a path, 
 Quality bits of labels; none of them removes a segment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 

@@ -7,8 +7,6 @@ Introduction to the Bootstrap*, 1993, chapter 11). The offset between two footpr
 than too small.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit

@@ -1,7 +1,5 @@
 """The two energies of a segment, either of which can be trained on: total, and net of the robot's idle power."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """Which channels a tensor has, and how they are formed from the stored layers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

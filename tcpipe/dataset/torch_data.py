@@ -1,7 +1,5 @@
 """Batches as an iterable torch dataset: imported only when a split is asked for it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

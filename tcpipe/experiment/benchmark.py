@@ -6,8 +6,6 @@
     DATASET/KIND-SEED/model, evaluation     each training, and its evaluation; what is complete is not made again
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

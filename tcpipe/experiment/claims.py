@@ -4,8 +4,6 @@ The importance of height, class, several classes and slow ground is built into t
 and is no claim.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

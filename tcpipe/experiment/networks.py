@@ -3,8 +3,6 @@
 Each takes as many steps as the one network, and is centred by class by the same rule.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """``tcpipe reproduce``: the paper's experiment from a simulated site to its claims; every stage resumes."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import Counter

@@ -7,8 +7,6 @@ aside returns, all other temporaries are removed.
 This module also checks paths of users: inputs must exist, outputs must be on this machine (else exit code 2).
 """
 
-from __future__ import annotations
-
 import atexit
 import ctypes
 import errno

@@ -5,8 +5,6 @@ cache is the directory ``TCPIPE_CACHE``, else one in the user's cache directory.
 removes the least recently used files.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import tempfile

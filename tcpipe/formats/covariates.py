@@ -1,7 +1,5 @@
 """Tables of others, CSV or Parquet; covariates (ground, weather), of which a sample gets the last row before it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Croissant 1.1 metadata of a dataset (MLCommons)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The card of a dataset, ``dataset.json``: all that is needed to use, cite and check it, as dataclasses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Literal

@@ -17,8 +17,6 @@ smallest digest.
 5. The state is a function of the documents: `scan` computes it, and nothing else is stored.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import re

@@ -1,7 +1,5 @@
 """GeoJSON (RFC 7946: WGS84, lon before lat): polygons such as the regions of a split, and lines such as paths."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A JSON document holds the sha256 of the rest of itself, a page that of all befor
 document lists, by path, size and sha256, is proved by it in turn.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Callable, Mapping

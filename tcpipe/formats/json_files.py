@@ -1,7 +1,5 @@
 """JSON documents (manifests, cards): sorted keys, no clock, so that the same content is the same bytes."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -5,8 +5,6 @@ decoded, the headers of all pages say how large the table becomes: one that is o
 (`MOST_BYTES`, `MOST_TIMES`).
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 import os

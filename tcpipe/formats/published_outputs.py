@@ -10,8 +10,6 @@ sha256 does not begin with the digest in their name are no pointer. Files at a U
 there, are read as they are.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """TOML files: recipes, read, checked (all errors together) and written with comments; the package's robot profiles."""
 
-from __future__ import annotations
-
 import logging
 import os
 import tomllib

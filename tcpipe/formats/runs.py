@@ -1,7 +1,5 @@
 """The record of one run: its JSON is the manifest, and what is asked of all runs at once is a part of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Runs in a store: their manifests and tables, each verified when it is read."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Files of many arrays with names, the weights of a network: NumPy's ``.npz``, the same arrays as the same bytes."""
 
-from __future__ import annotations
-
 import zipfile
 import zlib
 from collections.abc import Mapping

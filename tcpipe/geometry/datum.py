@@ -8,8 +8,6 @@ Source: B. Hofmann-Wellenhof, H. Lichtenegger, E. Wasle, "GNSS", Springer 2008, 
 rounding.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -6,8 +6,6 @@ from it by up to 1.15 % a segment on noisy data. Stamps are int64 nanoseconds an
 since the first stamp.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

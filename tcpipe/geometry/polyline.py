@@ -6,8 +6,6 @@ that they add up. Stamps are int64 nanoseconds and strictly increasing. The call
 (docs/explanation/rulings.md, Endpoints and Gaps).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

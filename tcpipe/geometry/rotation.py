@@ -9,8 +9,6 @@ the quaternion of a matrix follows S. W. Shepperd, "Quaternion from rotation mat
 1978.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """Evaluation as in the paper's section V for any model and dataset: tables I to III and V, with the noise floor."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace

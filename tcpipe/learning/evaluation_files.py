@@ -7,8 +7,6 @@
     predictions.parquet   labels and predictions of every sample
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 

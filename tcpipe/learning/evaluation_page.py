@@ -1,7 +1,5 @@
 """Page of an evaluation: verdict, samples, and tables with the paper's (Eder and Steinbauer-Wagner, section V)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Literal

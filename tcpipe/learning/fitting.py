@@ -8,8 +8,6 @@
 Both are means over samples, with the maxima of train; functions here take labels and predictions divided by these.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal

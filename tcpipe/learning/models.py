@@ -9,8 +9,6 @@
     history.csv        losses of every epoch
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -3,8 +3,6 @@
 A model folder never names code; it contains arrays, and the digest of the code that made them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import logging

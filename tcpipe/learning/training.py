@@ -1,7 +1,5 @@
 """``tcpipe train``: from a dataset to a model folder."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

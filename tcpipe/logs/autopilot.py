@@ -4,8 +4,6 @@ Autopilots count time from boot, and use body axes forward, right, down and nort
 become forward, left, up and east, north, up (REP-103). base_link is the origin of the autopilot's body frame.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

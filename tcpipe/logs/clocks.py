@@ -11,8 +11,6 @@ before September 2001 are no wall clock's. Where most topics count such a time, 
 epoch is opened: topics without a usable header get the simulation's time by their log time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal

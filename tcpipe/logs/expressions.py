@@ -1,7 +1,5 @@
 """Expressions of columns in a recipe, as ``(velL + velR) / 2`` or ``pvt.lat * 1e-7``, and units in column names."""
 
-from __future__ import annotations
-
 import ast
 import re
 import unicodedata

@@ -5,8 +5,6 @@ parent_from_child). A transform counts as static when all its messages agree, so
 well.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass

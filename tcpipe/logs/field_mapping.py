@@ -4,8 +4,6 @@ One mapping serves tables (`[tables.<role>]`) and custom messages (`[read.fields
 each in its unit. Names of columns and fields propose the mapping.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass

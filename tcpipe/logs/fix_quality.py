@@ -5,8 +5,6 @@ description (carrSoln), MAVLink (GPS_FIX_TYPE), sensor_msgs/NavSatStatus, gps_co
 augmentation (2) is RTK, fixed or float.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 

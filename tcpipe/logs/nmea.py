@@ -8,8 +8,6 @@ checksum is the exclusive or of all bytes between ``$`` and ``*``. Height above 
 NMEA 0183 v4.11, sentences GGA, RMC, VTG.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

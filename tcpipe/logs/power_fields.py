@@ -1,7 +1,5 @@
 """Find voltage, current and power of the drive among fields of a message, or columns of a table, by their names."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ to one entry, so their sum is the odometer (docs/explanation/rulings.md, Marked,
 The catalogue of findings states how to avoid each large loss (``lost-...``).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

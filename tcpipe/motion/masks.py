@@ -4,8 +4,6 @@ Rulings: docs/explanation/rulings.md, Acceleration, At the limit, In-place rotat
 rows, shape (N,). A slowdown by terrain is the signal: with known commands, no function here marks it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from tcpipe.arrays import Floats, Ints, Mask

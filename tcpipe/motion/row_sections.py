@@ -4,8 +4,6 @@ A piece ends at a step of the stamps other than the track's period, or at a new 
 (docs/explanation/rulings.md, Gaps).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

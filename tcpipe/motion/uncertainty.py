@@ -14,8 +14,6 @@ position error, |sigma_2 - sigma_1| (both by the triangle inequality); and in a 
 error moves the estimate, by sqrt(sigma_1² - sigma_2²).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -10,8 +10,6 @@ seconds is its square times k / T (Bendat and Piersol, Random Data, 4th ed., 8.2
 bandwidth B); k is estimated from differences of near batches.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

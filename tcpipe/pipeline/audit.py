@@ -1,7 +1,5 @@
 """Judge the uncertainty of a run: withhold fixes in windows, fuse the rest, and compare the track with them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

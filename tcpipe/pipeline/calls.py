@@ -1,7 +1,5 @@
 """Calls on a store: the record of each call, open and killed calls, durations of calls, and estimates from these."""
 
-from __future__ import annotations
-
 import logging
 import os
 import resource

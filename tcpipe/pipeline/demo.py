@@ -1,7 +1,5 @@
 """The demo: a simulated site through the whole pipeline, as a user would run it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Changes between two datasets and their causes: code, recipe keys, logs, maps, region; and shifts of labels."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

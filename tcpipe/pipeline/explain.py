@@ -1,7 +1,5 @@
 """Where a sample came from, down to log, stamps and message ranges."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Any topics of a log as Parquet: useful to people who need nothing else of tcpipe."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence

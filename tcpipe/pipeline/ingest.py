@@ -1,7 +1,5 @@
 """From logs to labelled segments in the store: one task a log, side by side, each whole or not at all."""
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """One log becomes a run of the store: read, fused, masked, cut and labelled, each file whole or not at all."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack

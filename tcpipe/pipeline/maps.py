@@ -1,7 +1,5 @@
 """Add a map to the store: rasters of one site on one common grid."""
 
-from __future__ import annotations
-
 import glob
 import logging
 import os

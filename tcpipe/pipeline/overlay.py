@@ -4,8 +4,6 @@ ROS 2 messages in MCAP: Foxglove, Rerun and PlotJuggler all read them (docs/how-
 tables' columns.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress

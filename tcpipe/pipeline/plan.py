@@ -1,7 +1,5 @@
 """Tasks and results of ``ingest``, and the decision for each log, which ``--dry-run`` and ``status`` show, too."""
 
-from __future__ import annotations
-
 import logging
 import time
 import traceback

@@ -4,8 +4,6 @@ The excerpt goes through the very stages that ingest runs, in memory: what is pr
 would give.
 """
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Problems of runs, logs and calls, which cause exit code 3 until acknowledged; identified by code and content."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ A removal is safe beside other calls (ADR-36): only documents that did not count
 that was listed before a second scan and that no document of this scan names. While another call may run, nothing goes.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Write the HTML page of a run, a dataset, or a store."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import suppress

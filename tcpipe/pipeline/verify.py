@@ -1,7 +1,5 @@
 """Re-read everything a path holds and compare it with what was written down about it: seals, checksums, counts."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass

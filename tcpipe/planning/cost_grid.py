@@ -6,8 +6,6 @@ passing another's centre: (1, 0), (2, 1), (1, 1), (1, 2) and so on: 0°, 26.6°,
 the grid's east. A path of such steps is at most 1 / cos(13.3°) - 1 = 2.8 % longer than a straight line.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ largest values of training, not quantiles. Segments are processed in batches; a 
 model predicts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

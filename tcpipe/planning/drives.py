@@ -1,7 +1,5 @@
 """Time and energy of whole ingested drives, measured and predicted, as a file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

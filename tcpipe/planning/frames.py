@@ -3,8 +3,6 @@
 The grid of a CRS is turned against true north by the meridian convergence, up to 3° in a UTM zone: 10 m at 300 m.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """Files of `tcpipe predict-path` (path segments, totals) and `tcpipe plan-path` (GeoJSON, messages for Nav2)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

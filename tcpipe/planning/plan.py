@@ -9,8 +9,6 @@ turns and without, as steps and as straight lines, and for ``risk`` with several
 a cell added to its cost. The returned path is the one with the least cost predicted by `tcpipe predict-path`.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Time, energy and their σ on the edges of a graph of Nav2's route server."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass

@@ -19,8 +19,6 @@ interpolated between the two nearest courses. The result never costs more than t
 closed to them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import NamedTuple

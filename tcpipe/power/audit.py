@@ -6,8 +6,6 @@ inverse); if the voltage rises with the current, the current flows back and its 
 errors found inflate σ.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

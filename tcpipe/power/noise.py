@@ -12,8 +12,6 @@ an integral of straight lines follows exactly. The model is of the whole record;
 there give the size of the processes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

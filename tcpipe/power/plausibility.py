@@ -3,8 +3,6 @@
 A meter may be read less often than its messages are sent: the neighbours of a value are the nearest different values.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 

@@ -16,8 +16,6 @@ known; then
 Every rule is prorated at both ends of a span. Negative power (regeneration) counts as it is.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Rails from the messages of power topics: verified, with every current positive when drawn."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace

@@ -13,8 +13,6 @@ of all that time. If the power of a run is a random walk, the variance of a mean
 after the stamp is (a³ + b³) / (2 (a + b)³) times the mean squared change of the smoothed record over a + b seconds.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -12,8 +12,6 @@ independent:
 The limits were measured on logs of two Warthogs and a rover and on simulated drives (docs/explanation/uncertainty.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 

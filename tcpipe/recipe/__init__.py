@@ -8,8 +8,6 @@ Outside its bounds a value has no meaning or unlimited cost: bounds are far outs
 site.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase

@@ -5,8 +5,6 @@ tables and keys here finds all of them. A whole number may be written as a float
 JSON Schema; numpy's scalars and arrays become Python's; text is no number, nor is a truth value.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import json

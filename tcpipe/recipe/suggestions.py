@@ -1,7 +1,5 @@
 """Recipe parts that messages suggest; made only here, by the recipe's own rules, so that the recipe accepts them."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

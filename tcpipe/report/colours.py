@@ -1,7 +1,5 @@
 """Colours of pages and pictures, which differ for any colour vision, on light and dark backgrounds."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from tcpipe.tables.bits import DropReason

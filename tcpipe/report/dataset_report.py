@@ -1,7 +1,5 @@
 """The page of a dataset: its samples on the map, labels, losses, repeatability, leakage."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace

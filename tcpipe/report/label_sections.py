@@ -1,7 +1,5 @@
 """Sections on labels: losses, quality bits, error budget, physics of the robot, repeatability."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 

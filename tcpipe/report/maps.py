@@ -1,7 +1,5 @@
 """Maps of pages: the samples of a dataset with the plot beside it, and the track of a run over a map of the store."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field

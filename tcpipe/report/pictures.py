@@ -1,7 +1,5 @@
 """Pictures: of patches and maps as WebP inside a page, and quick looks of maps as files."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections import Counter

@@ -10,8 +10,6 @@ Colours of axes and grids follow the page's light or dark scheme (``page.css``);
 `tcpipe.report.colours`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

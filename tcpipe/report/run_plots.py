@@ -1,7 +1,5 @@
 """A run over time: one axis of seconds and one cursor for all plots, which the page's script fills with series."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

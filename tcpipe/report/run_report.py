@@ -1,7 +1,5 @@
 """The page of a run: map, sensors over time, use of the distance, labels, and how far each sensor agrees."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

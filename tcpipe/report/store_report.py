@@ -1,7 +1,5 @@
 """The page of a store: all runs, changes over time, losses, findings, datasets and failed logs."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence

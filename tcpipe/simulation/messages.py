@@ -1,7 +1,5 @@
 """Readings as the topics a Husky records: ROS 1 as husky_base names them, ROS 2 as clearpath's packages do."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial

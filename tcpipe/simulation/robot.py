@@ -4,8 +4,6 @@ The plant is simple, but contains every effect that a label should contain: the 
 at full speed, rolling depends on the class (and on hidden properties), turning scrubs, the battery sags.
 """
 
-from __future__ import annotations
-
 from dataclasses import astuple, dataclass, field
 
 import numpy as np

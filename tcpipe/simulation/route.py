@@ -7,8 +7,6 @@ Time runs at 200 Hz. Along a leg only position on the path and wheel speed are i
 ground distance and power follow exactly from the surface, the projection and the robot model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 The paper's site follows the paper as far as described there: ``paper_site.toml`` has its numbers, each with its source.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """The files of a simulated site: rasters, class table, split region, logs, truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

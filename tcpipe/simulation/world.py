@@ -6,8 +6,6 @@ broadcast; hills are separable, so that a raster costs an outer product. Classes
 `tcpipe.terrain.layers.PAPER_CLASSES`; the last four are traversable.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field
 from functools import cached_property

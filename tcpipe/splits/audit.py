@@ -1,7 +1,5 @@
 """Leakage audit: ground that test and unseen samples share with training, by near pairs of footprints in one plane."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

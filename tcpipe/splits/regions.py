@@ -4,8 +4,6 @@ A footprint belongs to a region only if the whole rotated square is inside; one 
 it than the buffer, belongs to none. Ground outside all regions is unseen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum

@@ -1,7 +1,5 @@
 """Segments to LabelledSegments: power, velocity, duration and energy of each segment, with uncertainty and findings."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace

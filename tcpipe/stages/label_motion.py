@@ -3,8 +3,6 @@
 Facts and findings of labelling: the run's energy by entry, the noise floor, the count of every quality bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors common to all segments of a run (gain and zero of power, scale of a lone odometry), and their findings."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 

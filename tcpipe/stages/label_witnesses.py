@@ -4,8 +4,6 @@ An internal consistency check is no witness. A witness that contradicts a label 
 witness is "confirmed by nothing" and at best usable with care.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Track to MaskedTrack: mark rows that are not steady driving or not usable, with the reason; nothing is deleted."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

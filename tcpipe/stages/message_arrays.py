@@ -1,7 +1,5 @@
 """Interface of logs to stages (`LogReader`); tables as numpy arrays and power rails; foreign poses as fixes."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol, TypeVar

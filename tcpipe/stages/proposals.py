@@ -4,8 +4,6 @@
 ``doubt`` states what remains to be checked.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

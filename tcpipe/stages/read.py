@@ -1,7 +1,5 @@
 """Read: a log becomes one table a role, in SI units, on one clock, with every sensor's place (L0 to L1)."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast, get_args

@@ -1,7 +1,5 @@
 """Topics of power: their messages as rails, whether they are averages, and rows that repeat a slower reading."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 

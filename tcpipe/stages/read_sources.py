@@ -4,8 +4,6 @@ A sensor's extrinsics come from the recipe or from static transforms, or are ass
 pose (SLAM, post-processing) gets longitude and latitude if the recipe states its CRS; it is used as GNSS.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast, get_args

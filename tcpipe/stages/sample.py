@@ -1,7 +1,5 @@
 """LabelledSegments to patches: what the ground of each segment looks like on its map, and why some have no patch."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """MaskedTrack to Segments: cut every steady section by chord, and account for every metre of the track."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Bits of ``dropped_by`` (track rows) and ``quality`` (segments), entries of the distance breakdown; values stay."""
 
-from __future__ import annotations
-
 from enum import IntFlag
 
 

@@ -3,8 +3,6 @@
 Counts and metres are by role, by reason or by entry of the distance breakdown. A number that is None is unknown.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -6,8 +6,6 @@ anything about a run reads findings; only the command line and the pages turn th
 Catalogue of findings (``catalogue.toml``): meaning and remedy of each code, and the thresholds that decide it.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

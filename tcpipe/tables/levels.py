@@ -5,8 +5,6 @@ Frames follow REP-103 and REP-105: base_link is x forward, y left, z up; the tra
 origin.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace

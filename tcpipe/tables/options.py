@@ -3,8 +3,6 @@
 The modules that declare options import neither numpy nor pyarrow, so that ``--help`` starts fast.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from difflib import get_close_matches

@@ -5,8 +5,6 @@ not degrees, feet or Web Mercator. A CRS without an authority's code keeps the d
 bound CRS.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

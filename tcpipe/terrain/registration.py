@@ -8,8 +8,6 @@ of the path (block bootstrap, Künsch 1989), since errors of GNSS are correlated
 metres. A shift along which the ground does not vary, or repeats itself, is unobservable and stays zero.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ A pixel of a level spans ``factor`` x ``factor`` map pixels: their mean, or thei
 id; no data counts as a class). A patch takes the coarsest level that is not coarser than its own pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ patch's surroundings are first copied from the tiles into a small window that fi
 inner loops are unsigned, since numba tests signed ones for Python's negative indices.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@
 strided view.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

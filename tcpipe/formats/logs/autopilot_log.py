@@ -4,8 +4,6 @@
 sensor_msgs/Imu.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections import Counter

@@ -5,8 +5,6 @@ messages; after a chunk stands an index record for each of its connections; the 
 summary of every chunk. A bag carries no checksum of its own: bz2 has one, lz4 and plain chunks have none.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

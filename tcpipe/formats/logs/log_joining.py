@@ -5,8 +5,6 @@ transforms only into the part in which they came: a later part that is read alon
 part in its folder.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence

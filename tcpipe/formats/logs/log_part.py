@@ -4,8 +4,6 @@ A `LogPart` is one file of a log. `tcpipe.formats.logs.log_file` joins the parts
 tables.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from abc import ABC, abstractmethod

@@ -4,8 +4,6 @@ A chunk is decompressed only when it holds a wanted channel, its CRC is checked,
 no checksum covers) is believed only as far as the chunk's own records bear it out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace

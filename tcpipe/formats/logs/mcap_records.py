@@ -1,7 +1,5 @@
 """The records of an MCAP file and its summary: https://mcap.dev/spec. A record: opcode, length (uint64), content."""
 
-from __future__ import annotations
-
 import itertools
 import struct
 from array import array

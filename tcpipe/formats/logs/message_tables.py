@@ -1,7 +1,5 @@
 """Logs in other files than bags: each topic is a table of messages, with the interface of `log_file.Log`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ definitions tcpipe bundles for its robots, or from the standard sets that rosbag
 Types are kept by definition text, never by name alone: two logs, or two topics, may mean different things by one name.
 """
 
-from __future__ import annotations
-
 import functools
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping

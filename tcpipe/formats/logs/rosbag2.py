@@ -1,7 +1,5 @@
 """ROS 2 bags: a directory of .db3 or .mcap files with metadata.yaml, split, and compressed by file or by message."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterator, Mapping

@@ -5,8 +5,6 @@ either becomes a message or is counted as damage, and a file whose pages contrad
 a damaged file, ids are read upward until an error and downward until an error.
 """
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Folders of tables that the recipe maps, and the files in them; polars is loaded only when a table is read."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterator, Mapping

@@ -10,8 +10,6 @@ A table of text is described by its first lines: what separates its fields, what
 so on where it has no header), what is comment. A cell that is no number where one is wanted is counted, never guessed.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

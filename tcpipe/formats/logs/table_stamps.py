@@ -1,7 +1,5 @@
 """Stamps of tables: counters, dates and times as text, milliseconds of a day, and counters tied to UTC coarsely."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ the columns patched in; where a field lies is found by serialising it twice with
 of the encoding.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

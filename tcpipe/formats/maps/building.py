@@ -1,7 +1,5 @@
 """Building a map: rasters that need not share grid, resolution or CRS, put on one common grid, window by window."""
 
-from __future__ import annotations
-
 import csv
 import logging
 import re

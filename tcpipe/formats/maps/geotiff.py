@@ -10,8 +10,6 @@ tags, south-up and rotated affines, scale and offset tags, units, palettes, alph
 dealt with here; what leaves is metres, grey from 0 to 255, or raw class values, each with a mask.
 """
 
-from __future__ import annotations
-
 import logging
 import shlex
 import warnings

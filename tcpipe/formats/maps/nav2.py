@@ -6,8 +6,6 @@ scale at 99. A .pgm has no alpha, so that unknown cells are lethal. In mode ``ra
 Messages are JSON, which is YAML too: ``ros2`` commands read both.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Container, Iterator, Mapping, Sequence

@@ -5,8 +5,6 @@ in a raster, else an id. Where polygons overlap, the later feature covers the ea
 class of the polygon that contains its centre; ground outside all polygons has no data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

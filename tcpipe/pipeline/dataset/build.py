@@ -1,7 +1,5 @@
 """Building a dataset from labelled segments and maps: sample, split, audit, write; complete or not at all."""
 
-from __future__ import annotations
-
 import logging
 import shlex
 from collections.abc import Collection, Container, Iterator, Sequence

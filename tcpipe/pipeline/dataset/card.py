@@ -1,7 +1,5 @@
 """The card of a dataset (``dataset.json``), and findings on its samples."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 

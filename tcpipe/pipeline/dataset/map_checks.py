@@ -1,7 +1,5 @@
 """Runs against maps: the map's registration by heights, contradictions between map and track, and driven obstacles."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

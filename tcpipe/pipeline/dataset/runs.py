@@ -1,7 +1,5 @@
 """The runs of a dataset: intact runs of one robot and recipe, and findings on excluded ones."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

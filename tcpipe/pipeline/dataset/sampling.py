@@ -1,7 +1,5 @@
 """Sampling of segments of all runs: near segments in parallel batches, pixels in a spool until they are written."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The split of sampled patches: regions in the map's plane, the holdout, the leakage audit."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Datasets without coordinates: metres and seconds from unknown origins, numbers for names, a card of listed fields."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Writing a dataset from chosen inputs: sample, split, audit, describe; card and page last."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 from collections.abc import Iterator, Sequence
