@@ -145,7 +145,9 @@ def _prepare_section(
         gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
         if (jumpy := jitter_s > 0).any():
             share, median_s = float(jumpy.mean()), float(np.median(jitter_s[jumpy]))
-            findings.append(make_finding("stamp-jitter", fixes, jitter_fraction=share, jitter_s=median_s))
+            finding = make_finding("stamp-jitter", fixes, jitter_fraction=share, jitter_s=median_s)
+            # Where most fixes jitter, most places are doubted.
+            findings.append(replace(finding, severity="warning") if share > 0.5 else finding)
     return Section(
         0,
         Measurements(nonholonomic_std_mps=config.nonholonomic_std_mps).replace_sensors(found | {GNSS: gnss}),

@@ -14,8 +14,9 @@ from tcpipe.errors import FusionError
 from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
+from tcpipe.stages.fuse_inputs import prepare_sections
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.findings import Subject, make_finding
+from tcpipe.tables.findings import Subject, make_finding, select_findings
 from tcpipe.tables.levels import COMMAND, GNSS, IMU, POSE, POWER, VISUAL_ODOMETRY, WHEEL_ODOMETRY, Sensor, Streams
 
 SITE = (15.46, 47.06, 450.0)
@@ -149,6 +150,17 @@ def test_findings_and_rejections(track):
     assert sum(facts.rejected.values()) == track.rejections.num_rows > 0
     assert set(track.rejections["reason"].to_pylist()) == {"gate"}
     assert track.info.estimator == "smoother"
+
+
+@pytest.mark.parametrize(("jittery", "severity"), [(0.2, "note"), (1.0, "warning")])
+def test_jitter_of_most_stamps_is_a_warning_as_it_doubts_most_places(streams, jittery, severity):
+    fixes = streams.tables["gnss"]
+    late_s = np.random.default_rng(1).exponential(0.3, fixes.num_rows)
+    late_s[round(jittery * fixes.num_rows) :] = 0.0
+    stamp_ns = np.sort(to_integers(fixes, "stamp_ns") + np.rint(1e9 * late_s).astype(np.int64))
+    late = replace(streams, tables={**streams.tables, "gnss": with_columns(fixes, stamp_ns=stamp_ns)})
+    (finding,) = select_findings(prepare_sections(late, FuseConfig())[0].findings, "stamp-jitter")
+    assert finding.severity == severity
 
 
 def without(streams, *roles):
