@@ -70,7 +70,7 @@ def compute_turns(quat_xyzw: Floats, rows: int = 1) -> Floats:
 
 
 def align_mounting(fixes: Positions, odometry: BodyVelocities | None, *, is_stated: bool) -> Positions:
-    """Return positions with the attitude of a robot that drives along its x axis, as the odometry tells its sign.
+    """Return positions with the attitude of a robot that drives along its x axis, with the sign of the odometry.
 
     Where the mounting is stated, only if the motion contradicts it; else without attitude where the robot hardly
     drives. Source: the TRIAD method, with the direction of motion first and the vertical second (H. D. Black, "A

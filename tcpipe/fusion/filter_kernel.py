@@ -88,7 +88,7 @@ class TickInputs(NamedTuple):
 
 
 class FilterModel(NamedTuple):
-    """What the filter assumes.
+    """Assumptions of the filter.
 
     Attributes
     ----------

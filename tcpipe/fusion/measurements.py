@@ -34,9 +34,9 @@ NO_TRUST = 1e6
 """Largest variances, of a kilometre or a kilometre a second; larger ones would cost digits of differences."""
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
 STATED_ARM_STD_M = (0.05, 0.05, 0.1)
-"""Of an antenna whose place is stated: a tape measure, and the height of base_link over the ground."""
+"""σ of a stated place of the antenna [m]: a tape measure, and the height of base_link over the ground."""
 UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)
-"""Of one whose place is not: it is on the robot."""
+"""σ of a place that is not stated [m]: the antenna is on the robot."""
 
 
 UNMEASURED_RAD2 = 1e2
@@ -146,7 +146,7 @@ class InertialMeasurements:
     gyro_std_radps, accelerometer_std_mps2 : white noise at the unit's rate, one axis.
     accelerometer_usable : False where the specific force is not one (gravity removed, other units): the gyroscope alone
     is used.
-    accelerometer_noise_mps2 : the same around each sample, shape (N,): vibration comes and goes with the motion; None:
+    accelerometer_noise_mps2 : the same around each sample, shape (N,): the motion causes vibration; None:
     the same throughout.
     """
 
@@ -168,7 +168,7 @@ class Measurements:
     """All measurements of one section of one clock epoch without a long gap; a role without measurements is None.
 
     At least one of ``gnss``, ``wheels`` and ``visual`` is there. ``nonholonomic_std_mps``: sideways and vertical body
-    velocity are zero to within this. ``doppler`` goes with ``gnss``, whose antenna it is of.
+    velocity are zero to within this. ``doppler`` is the velocity of the antenna of ``gnss``.
     """
 
     gnss: Positions | None = None
@@ -289,8 +289,8 @@ class Trajectory:
     forward_velocity_std_mps : [m/s], shape (N,), of the velocity along base_link's x axis.
     rejections : what the gate rejected, in time order: columns of the level REJECTIONS, shape (M,).
     displacement_std_m : [m], shape (N, 6), of the horizontal displacement from each row to the one
-        `DISPLACEMENT_LAGS_S` later, along its direction, the correlation of both ends counted exactly; NaN where no row
-        stands there, and throughout in a forward filter, which does not know it. In between the variance may be
+        `DISPLACEMENT_LAGS_S` later, along its direction, the correlation of both ends counted exactly; NaN where there
+        is no such row, and throughout in a forward filter, which does not know it. In between the variance may be
         interpolated in time, from zero at no time.
     facts : what the filter counted and settled on.
     """

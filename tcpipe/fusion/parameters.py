@@ -57,7 +57,7 @@ PARAMETERS = (
     Parameter("mounting of the pose", Error.POSE_MOUNT, 3, 0.0, 0.0, "rad", "`Positions.mounting_std_rad`"),
     Parameter("frame of the pose", Error.POSE_FRAME, 3, 0.05, 2e-3, "rad", "level to 3°; drifts by 1° a minute"),
 )
-"""What does not come from the run itself; the scales of odometries and the errors of fixes do, see `make_priors`."""
+"""Parameters with a prior of their own; that of scales of odometries and errors of fixes is by the run: `make_priors`."""
 FIX_AXES = np.array([1.0, 1.0, 1.7])
 """Ratio of lasting errors of fixes east, north and up [1]: no satellite is below."""
 _MINUTE_S = 60.0

@@ -72,7 +72,7 @@ LARGEST_EVENT = 9
 
 
 class Adjoint(NamedTuple):
-    """What the smoother carries back in time.
+    """State of the smoother on its way back in time.
 
     Attributes
     ----------
