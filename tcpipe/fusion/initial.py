@@ -138,9 +138,7 @@ def _estimate_position(
         driven_m = STEP_S * float(np.abs(track.speed_mps[grid_s < at_s[-1]]).sum())
     off = gnss.position_enu_m[few] - antenna_m
     std: Floats = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
-    if (
-        not gnss.has_heights
-    ):  # they count from the start: kilometres of uncertainty would lean on the plane by every tilt
+    if not gnss.has_heights:  # they count from the start: σ of kilometres would act on the plane by every tilt
         std[2] = 0.0
     position: Floats = np.median(off, axis=0)
     return position, std + np.array([0.1, 0.1, 0.2]) * max(driven_m, 1.0) + np.ptp(off, axis=0)

@@ -102,9 +102,8 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
             # In 100 s the mean of a varying scale strays by as much as the scale varies.
             std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].correlated.variance / 100.0)
     time_s = np.full(state.N, np.inf)
-    if m.odometries() and is_length_observable(
-        m, noise.horizontal
-    ):  # only fixes show how scales vary around their means
+    if m.odometries() and is_length_observable(m, noise.horizontal):
+        # Only fixes show how scales vary around their means.
         slips = {WHEELS: Error.WHEEL_SLIP, VISUAL: Error.VISUAL_SLIP}
         varying = [(slips[role], noise.odometries[role].correlated) for role in m.odometries()]
         for error, process in (*varying, (Error.SHARED_SCALE, noise.shared_scale)):
