@@ -104,8 +104,6 @@ def test_a_route_graph_gets_the_costs_of_its_edges(place: Path):
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (("predict-path", "none", "--path", "path.geojson"), 2, "no such directory"),
-        (("predict-path", "model", "--path", "none.geojson"), 2, "no such file"),
         (("predict-path", "model", "--path", "path.geojson", "--out", "path-segments.txt"), 2, "ends in .csv"),
         (
             ("plan-path", "model", "--from", _FROM, "--to", _TO, "--budget", "300"),
@@ -117,11 +115,6 @@ def test_a_route_graph_gets_the_costs_of_its_edges(place: Path):
         (("cost-map", "model", "--map", "other"), 1, "no map 'other'"),
         (("cost-map", "model", "--cell-size", "0"), 2, "--cell-size"),
         (("cost-map", "model", "--speed", "0.5"), 2, "has no input for the commanded speed"),
-        (
-            ("plan-path", "model", "--from", _FROM, "--to", _TO, "--speed", "0.5"),
-            2,
-            "has no input for the commanded speed",
-        ),
     ],
 )
 def test_bad_input_is_one_line(place: Path, arguments, code, words):
