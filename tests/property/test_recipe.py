@@ -33,7 +33,7 @@ def section(key):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    scenario = make_tiny(seconds=8.0)
+    scenario = make_tiny(seconds=5.0)
     return log_of(scenario, scenario.drives[0], tmp_path_factory.mktemp("site"))
 
 
