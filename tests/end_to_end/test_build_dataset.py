@@ -31,11 +31,9 @@ def built(tmp_path_factory):
     directory = tmp_path_factory.mktemp("build")
     store = small_store(directory)
     region = region_file(directory / "region.geojson", REGION)
-    results = {
-        name: build_dataset(directory / name, store=store.root, split=region, recipe=RECIPE, format=name)
-        for name in ("zarr", "parquet")
-    }
-    return directory, store, region, results
+    for name in ("zarr", "parquet"):
+        build_dataset(directory / name, store=store.root, split=region, recipe=RECIPE, format=name)
+    return directory, store, region
 
 
 @pytest.fixture(scope="module")
@@ -157,20 +155,10 @@ def test_croissant_names_every_file_and_column(built, samples):
 def test_the_same_bytes_whatever_the_jobs_and_whatever_the_batches(built, tmp_path, monkeypatch):
     from tcpipe.pipeline.dataset import sampling as dataset_sampling
 
-    directory, store, region, _ = built
+    directory, store, region = built
     monkeypatch.setattr(dataset_sampling, "_BATCH_ROWS", 150)
     build_dataset(tmp_path / "again", store=store.root, split=region, recipe=RECIPE, jobs=2)
     assert files(tmp_path / "again") == files(directory / "zarr")
-
-
-def test_a_second_identical_call_does_nothing_and_says_so(built):
-    directory, store, region, results = built
-    before = {path: path.stat().st_mtime_ns for path in (directory / "zarr").rglob("*")}
-    again = build_dataset(directory / "zarr", store=store.root, split=region, recipe=RECIPE)
-    assert again.status == "unchanged"
-    assert "nothing to do" in str(again)
-    assert again.card.splits == results["zarr"].card.splits
-    assert {path: path.stat().st_mtime_ns for path in (directory / "zarr").rglob("*")} == before
 
 
 @not_ours

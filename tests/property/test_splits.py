@@ -110,9 +110,10 @@ def test_a_run_that_is_recorded_later_takes_nothing_out_of_test(driven, holdout,
     corners, run = driven
     names = [f"r{i}" for i in range(run.max() + 1)]
     old = run < run.max()
-    before = split_of(corners[old], run[old], names, holdout=holdout, fraction=fraction).split
-    after = split_of(corners, run, names, holdout=holdout, fraction=fraction).split[old]
-    assert not ((before == "test") & (after == "train")).any()
+    before = split_of(corners[old], run[old], names, holdout=holdout, fraction=fraction)
+    after = split_of(corners, run, names, holdout=holdout, fraction=fraction)
+    assert not ((before.split == "test") & (after.split[old] == "train")).any()
+    assert holdout == "sample" or (before.fold == after.fold[old]).all()
 
 
 @settings(max_examples=60, deadline=None)

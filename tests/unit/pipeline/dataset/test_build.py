@@ -27,7 +27,7 @@ from tcpipe.formats.recipe_toml import make_recipe_id, parse_recipe
 from tcpipe.formats.runs import Call
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.verify import verify
-from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
+from tcpipe.recipe import LabelConfig, Recipe
 from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Subject, select_findings
@@ -309,28 +309,3 @@ def test_a_disk_that_fills_up_leaves_nothing_half_written(store, tmp_path, limit
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert len(caught.value.problems) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
-
-
-def splits_by_id(directory):
-    samples = pq.read_table(directory / "samples.parquet", columns=["sample_id", "split", "fold"])
-    return {row["sample_id"]: (row["split"], row["fold"]) for row in samples.to_pylist()}
-
-
-@pytest.mark.parametrize("holdout", ["block", "run"])
-def test_growth_takes_no_block_and_no_run_out_of_test(store, tmp_path, holdout):
-    lanes_m = -15.0 + 6.0 * np.arange(5)
-    recipe = Recipe(split=SplitConfig(block_m=4.0))
-    before = {}
-    for number, y_m in enumerate(lanes_m):
-        add(store, f"run{number}", (y_m,), x=(-14.0, 14.0), start_ns=number * 10**15)
-        if number < 2:
-            continue
-        build(store, tmp_path, holdout=holdout, recipe=recipe)
-        now = splits_by_id(tmp_path / "out")
-        for sample, (split, fold) in before.items():
-            assert now[sample][1] == fold
-            assert now[sample][0] == "test" or split == "train"
-        before = now
-    share = np.mean([split == "test" for split, _ in before.values()])
-    assert 0.15 <= share <= 0.25
-    assert {fold for _, fold in before.values()} == {0, 1, 2, 3, 4}
