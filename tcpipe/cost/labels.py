@@ -26,7 +26,7 @@ from tcpipe.power.noise import compute_median_period_s
 from tcpipe.power.rails import Rail, SampledSignal, is_power_only
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.facts import CAUSES, EnergyBudget
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ def pool_budgets(budgets: Iterable[EnergyBudget | None]) -> EnergyBudget | None:
     )
 
 
-def find_noise(budget: EnergyBudget | None, subject: Subject) -> tuple[Finding, ...]:
+def find_noise(budget: EnergyBudget | None, subject: Subject) -> Findings:
     """Return the finding that the noise floor of E is high."""
     if budget is None or budget.total < read_threshold("energy-noise", "max_total_fraction"):
         return ()

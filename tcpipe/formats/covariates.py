@@ -14,7 +14,7 @@ from tcpipe.formats.integrity import Checksum, compute_checksum
 from tcpipe.formats.logs.table_stamps import read_clock
 from tcpipe.logs.field_mapping import STAMP_UNITS
 from tcpipe.recipe.suggestions import format_recipe_key
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
@@ -34,7 +34,7 @@ class CovariateTable:
     time_column: str
     rows: pl.DataFrame
     """Values by column, numbers as float64 and all else as text, behind the stamps [ns]."""
-    findings: tuple[Finding, ...]
+    findings: Findings
 
     @property
     def span(self) -> tuple[str, str]:

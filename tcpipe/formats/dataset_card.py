@@ -11,7 +11,7 @@ from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.formats.maps.map_facts import Description, MapInputs
 from tcpipe.recipe import Recipe
 from tcpipe.tables.facts import EnergyBudget, Floor, HeldOut, PhysicsFit
-from tcpipe.tables.findings import Finding, Verdict, judge_by_code, omit
+from tcpipe.tables.findings import Finding, Findings, Verdict, judge_by_code, omit
 from tcpipe.tables.levels import LABELS
 from tcpipe.terrain.layers import TerrainClass
 
@@ -169,7 +169,7 @@ class RunSource:
     segments_sha256: str | None = None
     driven_m: float | None = None
     tags: Mapping[str, str] | None = None
-    findings: tuple[Finding, ...] = omit(())
+    findings: Findings = omit(())
     """Findings of its ingest."""
     energy_budget: EnergyBudget | None = None
     samples: int = 0
@@ -250,7 +250,7 @@ class MapSource:
     """By layer, of a user's own categorical ones."""
     classes_from: str | None = None
     inputs: MapInputs | None = None
-    findings: tuple[Finding, ...] = omit(())
+    findings: Findings = omit(())
     """Findings of building it."""
     registration: tuple[MapRegistration, ...] = ()
 
@@ -315,7 +315,7 @@ class DatasetCard:
     maps: tuple[MapSource, ...]
     flagged_samples: FlaggedSamples
     """How many samples carry a quality flag."""
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     """Findings of the dataset itself: its choice of runs, sampling and splits. Runs and maps have their own."""
     verdict: Verdict
     """By all findings of the dataset, its maps and the runs that have samples."""
@@ -351,12 +351,12 @@ class DatasetCard:
         return self.made_from.file_format
 
     @property
-    def findings_by_run(self) -> dict[str, tuple[Finding, ...]]:
+    def findings_by_run(self) -> dict[str, Findings]:
         """Findings of ingest, of every run."""
         return {run.run_id: run.findings for run in self.runs}
 
     @property
-    def findings_by_map(self) -> dict[str, tuple[Finding, ...]]:
+    def findings_by_map(self) -> dict[str, Findings]:
         """Findings of building each map."""
         return {source.name: source.findings for source in self.maps}
 

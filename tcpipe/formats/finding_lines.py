@@ -21,6 +21,7 @@ from tcpipe.tables.findings import (
     WITNESSES_OF_LABEL,
     Affected,
     Finding,
+    Findings,
     Remedy,
     Severity,
     Verdict,
@@ -225,7 +226,7 @@ class FindingGroup(Generic[K]):
     """Findings of one code in several runs, logs or maps."""
 
     code: str
-    of: Mapping[K, tuple[Finding, ...]]
+    of: Mapping[K, Findings]
     """By run, log or map."""
 
     @cached_property
@@ -241,7 +242,7 @@ class FindingGroup(Generic[K]):
 
 def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[FindingGroup[K]]:
     """Return the findings grouped by code: the worst first, then those of most runs."""
-    found: dict[str, dict[K, tuple[Finding, ...]]] = {}
+    found: dict[str, dict[K, Findings]] = {}
     for key, each in findings:
         for finding in each:
             findings_by_subject = found.setdefault(finding.code, {})

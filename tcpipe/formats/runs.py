@@ -15,6 +15,7 @@ from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFit, StageFacts
 from tcpipe.tables.findings import (
     AFFECTED,
     Finding,
+    Findings,
     StageReport,
     Subject,
     Verdict,
@@ -52,7 +53,7 @@ class LogFailure:
     problems: tuple[str, ...]
     version: str
     """Version of tcpipe that failed."""
-    findings: tuple[Finding, ...] = omit(())
+    findings: Findings = omit(())
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,9 +262,9 @@ class RunFacts:
     """End of the last segment [ns since 1970]."""
     distance_by_reason_m: Mapping[str, float]
     """Distance breakdown [m], by entry."""
-    findings: tuple[Finding, ...]
+    findings: Findings
     """Findings of all stages."""
-    damage: tuple[Finding, ...] = ()
+    damage: Findings = ()
     """Findings about damage to the log."""
     energy_joule: float | None = None
     """Energy of the whole drive, also outside segments [J]; None without power."""
@@ -342,7 +343,7 @@ class Run(RunFacts):
     counts: Counts
     info: TrackInfo
     topics: tuple[TopicCount, ...] = ()
-    notes: tuple[Finding, ...] = ()
+    notes: Findings = ()
     """On the log."""
 
 

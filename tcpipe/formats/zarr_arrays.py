@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from tcpipe.formats.published_outputs import FetchedShards
 
+Shape = tuple[int, ...]
 Compression = Literal["zstd", "lz4"]
 """zstd is smaller, lz4 two to three times as fast to read."""
 
@@ -50,10 +51,10 @@ def add_array(
     group: zarr.Group,
     name: str,
     *,
-    shape: tuple[int, ...],
+    shape: Shape,
     dtype: np.dtype[Any] | type,
-    chunks: tuple[int, ...],
-    shards: tuple[int, ...] | None = None,
+    chunks: Shape,
+    shards: Shape | None = None,
     dimensions: tuple[str, ...],
     fill_value: float | str = 0,
     attributes: Mapping[str, Any] | None = None,
@@ -124,9 +125,9 @@ class ShardedArray:
     """An array on disk, by its chunks; ``chunk_shape`` divides ``shard_shape``."""
 
     path: Path
-    shape: tuple[int, ...]
-    chunk_shape: tuple[int, ...]
-    shard_shape: tuple[int, ...]
+    shape: Shape
+    chunk_shape: Shape
+    shard_shape: Shape
     dtype: np.dtype[Any]
     fill: float
     sparse: bool
@@ -135,9 +136,9 @@ class ShardedArray:
     """Codec of a chunk without its checksum."""
     fetched: FetchedShards | None = None
     """Where the shards are; None: on this machine."""
-    _indices: dict[tuple[int, ...], NDArray[np.uint64]] = field(default_factory=dict)
+    _indices: dict[Shape, NDArray[np.uint64]] = field(default_factory=dict)
 
-    def chunk(self, index: tuple[int, ...], out: AnyArray | None = None) -> AnyArray:
+    def chunk(self, index: Shape, out: AnyArray | None = None) -> AnyArray:
         """Return a whole chunk even at the array's end, shape ``chunk_shape``; in ``out`` (contiguous) if given."""
         shard, place = self._shard_and_place(index)
         out = np.empty(self.chunk_shape, self.dtype) if out is None else out
@@ -156,7 +157,7 @@ class ShardedArray:
             raise StoreError(f"{path}: chunk {index} is damaged ({error})") from None
         return out
 
-    def expect(self, indices: Iterable[tuple[int, ...]]) -> None:
+    def expect(self, indices: Iterable[Shape]) -> None:
         """Fetch remote chunks that will be read soon; one that cannot be fetched raises its error when it is read."""
         if self.fetched is None:
             return
@@ -174,7 +175,7 @@ class ShardedArray:
                 pieces += [(path, offset, size)] if offset != _ABSENT else []
         self.fetched.prefetch(pieces)
 
-    def _shard_and_place(self, index: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    def _shard_and_place(self, index: Sequence[int]) -> tuple[Shape, Shape]:
         per_shard = self.per_shard
         shard = tuple(i // n for i, n in zip(index, per_shard, strict=True))
         return shard, tuple(i % n for i, n in zip(index, per_shard, strict=True))
@@ -212,11 +213,11 @@ class ShardedArray:
         return b"".join((*pieces, table, _compute_crc(table)))
 
     @staticmethod
-    def shard_name(shard: tuple[int, ...]) -> str:
+    def shard_name(shard: Shape) -> str:
         """Return the name of a shard's file, below the array's directory, from its number along each axis."""
         return "/".join(("c", *map(str, shard)))
 
-    def _encoded(self, values: AnyArray, place: tuple[int, ...]) -> bytes:
+    def _encoded(self, values: AnyArray, place: Shape) -> bytes:
         cut = tuple(slice(i * c, (i + 1) * c) for i, c in zip(place, self.chunk_shape, strict=True))
         chunk = values[cut]
         if chunk.shape != self.chunk_shape:
@@ -226,14 +227,14 @@ class ShardedArray:
         return bytes(self.codec.encode(np.ascontiguousarray(chunk)))
 
     @property
-    def per_shard(self) -> tuple[int, ...]:
+    def per_shard(self) -> Shape:
         """Chunks in a shard along each axis."""
         return tuple(s // c for s, c in zip(self.shard_shape, self.chunk_shape, strict=True))
 
-    def _shard_path(self, shard: tuple[int, ...]) -> Path:
+    def _shard_path(self, shard: Shape) -> Path:
         return self.path / self.shard_name(shard)
 
-    def _index(self, shard: tuple[int, ...]) -> NDArray[np.uint64]:
+    def _index(self, shard: Shape) -> NDArray[np.uint64]:
         """Return the shard's table of offsets and sizes, shape (*chunks per shard, 2)."""
         if shard not in self._indices:
             path = self._shard_path(shard)
@@ -263,9 +264,9 @@ class ShardedArray:
 def open_sharded(
     path: Path,
     *,
-    shape: tuple[int, ...],
-    chunk_shape: tuple[int, ...],
-    shard_shape: tuple[int, ...],
+    shape: Shape,
+    chunk_shape: Shape,
+    shard_shape: Shape,
     dtype: np.dtype[Any],
     fill: float,
     sparse: bool = False,

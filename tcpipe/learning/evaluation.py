@@ -47,6 +47,7 @@ from tcpipe.tables.findings import (
     PREDICTED,
     Affected,
     Finding,
+    Findings,
     Remedy,
     Severity,
     Subject,
@@ -164,7 +165,7 @@ class Evaluation:
     """Table V: errors of T by predictor and split."""
     baselines: tuple[BaselineResult, ...] = ()
     """Comparisons with baselines over all classes, by split, baseline and quantity."""
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     verdict: Verdict = field(default_factory=Verdict)
 
     @property

@@ -176,7 +176,7 @@ def _turn_axes(name: str, forward: Floats, right: Floats, down: Floats) -> dict[
 
 
 # ---------------------------------------------------------------- PX4
-def _convert_px4_fix(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_px4_fix(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     if "latitude_deg" in f:
         lat, lon, sea = f["latitude_deg"], f["longitude_deg"], f["altitude_msl_m"]
     else:  # until 2023
@@ -185,33 +185,33 @@ def _convert_px4_fix(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> t
     return time_us, {"latitude": lat, "longitude": lon, **_make_fix(log, f["fix_type"], sea), **accuracy}
 
 
-def _convert_px4_velocity(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_px4_velocity(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     known = (f["vel_ned_valid"] != 0) & (f["fix_type"] >= _IN_3D)
     axes = {"east": f["vel_e_m_s"], "north": f["vel_n_m_s"], "up": -f["vel_d_m_s"]}
     values = {name: np.where(known, axis, np.nan) for name, axis in axes.items()}
     return time_us, values | {f"{name}_std": f["s_variance_m_s"] for name in axes}
 
 
-def _convert_px4_imu(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_px4_imu(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     unknown = f["accelerometer_timestamp_relative"] == np.iinfo(np.int32).max
     force = np.where(unknown[:, None], np.nan, f["accelerometer_m_s2"])
     return time_us, _turn_axes("angular_velocity", *f["gyro_rad"].T) | _turn_axes("linear_acceleration", *force.T)
 
 
-def _convert_px4_battery(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_px4_battery(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     voltage, current = f["voltage_v"], f["current_a"]
     drawn = np.where(np.isin(current, UNMEASURED_AMP["battery_status"]), np.nan, -current)  # negative in BatteryState
     return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
 
 
-def _convert_px4_wheels(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_px4_wheels(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     """Return the mean of both wheels: drivers do not agree which is the left one."""
     if "RDD_WHEEL_RADIUS" not in log.parameters:
         raise KeyError("a wheel radius (RDD_WHEEL_RADIUS)")
     return time_us, {"linear_x": f["wheel_speed"].mean(axis=1) * log.parameters["RDD_WHEEL_RADIUS"]}
 
 
-def _convert_px4_command(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_px4_command(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     speed = f[next((name for name in _PX4_SPEEDS if name in f), _PX4_SPEEDS[0])]
     turn = {**log.find_last("rover_rate_setpoint", time_us, within_us=_HELD_US), **f}
     right = next((turn[name] for name in ("yaw_rate_setpoint", "yaw_rate") if name in turn), 0.0 * speed)
@@ -231,14 +231,14 @@ def _find_accuracy(log: Autopilot, name: str, time_us: Ints) -> Columns:
 _BESIDE_US = 50_000
 
 
-def _convert_ardupilot_fix(log: Autopilot, name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_ardupilot_fix(log: Autopilot, name: str, time_us: Ints, f: Columns) -> Stamped:
     values = {"latitude": f["Lat"], "longitude": f["Lng"], **_make_fix(log, f["Status"], f["Alt"])}
     if accuracy := _find_accuracy(log, name, time_us):
         values |= {"east_std": accuracy["HAcc"], "north_std": accuracy["HAcc"], "up_std": accuracy["VAcc"]}
     return time_us, values
 
 
-def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Ints, f: Columns) -> Stamped:
     """Return the fields of GPSFix, which has speed and course; its errors are those of 95 per cent."""
     accuracy, unknown = _find_accuracy(log, name, time_us), np.full(len(time_us), np.nan)
     error = 2.0 * accuracy.get("SAcc", unknown)
@@ -248,19 +248,19 @@ def _convert_ardupilot_velocity(log: Autopilot, name: str, time_us: Ints, f: Col
     return time_us, {**values, "status.status": status}
 
 
-def _convert_ardupilot_imu(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_ardupilot_imu(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     broken = (f.get("GH", 1) == 0) | (f.get("AH", 1) == 0)
     rate, force = ([np.where(broken, np.nan, f[f"{sensor}{axis}"]) for axis in "XYZ"] for sensor in ("Gyr", "Acc"))
     return time_us, _turn_axes("angular_velocity", *rate) | _turn_axes("linear_acceleration", *force)
 
 
-def _convert_ardupilot_battery(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_ardupilot_battery(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     scale = 1.0 if f["Volt"].dtype.kind == "f" else 0.01  # before 2015 in hundredths
     voltage, drawn = f["Volt"] * scale, f["Curr"] * -scale
     return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
 
 
-def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     """Return speed and turn between two messages from the distances of the wheels, stamped in the middle."""
     step_s = np.diff(time_us, prepend=np.nan) * 1e-6
     speed, right_m = list[Floats](), list[float]()
@@ -276,13 +276,13 @@ def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Ints, f: Colu
     return time_us - np.nan_to_num(step_s * 5e5).astype(np.int64), {"linear_x": ahead, "angular_z": turn}
 
 
-def _convert_ardupilot_command(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> tuple[Ints, Columns]:
+def _convert_ardupilot_command(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     steering = log.find_last("STER", time_us, within_us=_HELD_US)
     turn = -np.radians(np.nan_to_num(steering.get("DesTurnRate", np.zeros(len(time_us)))))
     return time_us, {"linear_x": f["DesSpeed"], "angular_z": turn}
 
 
-_Convert = Callable[[Autopilot, str, Ints, Columns], tuple[Ints, Columns]]
+_Convert = Callable[[Autopilot, str, Ints, Columns], Stamped]
 _PX4_COMMANDS = """rover_speed_setpoint rover_differential_setpoint rover_ackermann_setpoint rover_mecanum_setpoint
 differential_drive_setpoint"""
 _TOPICS = {

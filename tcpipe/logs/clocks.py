@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from tcpipe.arrays import AnyArray, Ints, Mask
 from tcpipe.tables.facts import ClockStep
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 
 SECOND_NS = 1_000_000_000
 FOLLOWS_NS = 10 * SECOND_NS
@@ -114,7 +114,7 @@ class SimulatedClock:
         """Seconds of the simulation in a second of the log."""
         return float(self.clock_ns[-1] - self.clock_ns[0]) / float(self.log_time_ns[-1] - self.log_time_ns[0])
 
-    def find_simulated_time(self) -> tuple[Finding, ...]:
+    def find_simulated_time(self) -> Findings:
         """Return the finding that durations are those of the simulation; none if the log's own clock is, too."""
         least = read_threshold("simulated-time", "min_rate_difference_fraction")
         if abs(self.rate - 1.0) < least and self.log_time_ns[0] < SIMULATED_NS:

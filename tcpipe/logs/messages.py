@@ -29,11 +29,12 @@ from tcpipe.logs.fix_quality import (
 )
 from tcpipe.logs.nmea import add_date, read_gga, read_over_ground
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 
 LOG_TIME = "log_time_ns"
 GNSS, GNSS_VELOCITY = Subject("role", "gnss"), Subject("role", "gnss_velocity")
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+_Arrays = dict[str, AnyArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +49,10 @@ class Readings:
     row: Ints
     log_time_ns: Ints
     header_ns: Ints | None
-    columns: dict[str, AnyArray]
+    columns: _Arrays
     dropped: dict[str, int] = field(default_factory=dict)
     notes: dict[str, int] = field(default_factory=dict)
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     own_time_ns: Ints | None = None
     """Time that the measurement itself carries (NMEA), as `read_header_ns`."""
 
@@ -119,7 +120,7 @@ def read_header_ns(columns: Columns) -> Ints | None:
     return columns[_STAMP[0]].astype(np.int64) * 1_000_000_000 + columns[_STAMP[1]].astype(np.int64)
 
 
-def _select_rows(columns: Columns, values: dict[str, AnyArray], drops: Mapping[str, Mask], **extra: Any) -> Readings:
+def _select_rows(columns: Columns, values: _Arrays, drops: Mapping[str, Mask], **extra: Any) -> Readings:
     """Return the readings of the rows that no reason drops; a row counts under its first reason."""
     keep = np.ones(len(columns[LOG_TIME]), bool)
     dropped: dict[str, int] = {}
@@ -145,7 +146,7 @@ def _read_vector(columns: Columns, prefix: str) -> Floats:
     return np.stack([columns[f"{prefix}.{axis}"].astype(float) for axis in "xyz"], -1)
 
 
-def _name_axes(name: str, suffix: str, values: Floats) -> dict[str, AnyArray]:
+def _name_axes(name: str, suffix: str, values: Floats) -> _Arrays:
     return {f"{name}_{axis}_{suffix}": values[:, i] for i, axis in enumerate("xyz")}
 
 
@@ -201,7 +202,7 @@ def _is_outside(lat_deg: Floats, lon_deg: Floats) -> Mask:
     return (np.abs(lat_deg) > 90) | (np.abs(lon_deg) > 180)
 
 
-def _read_gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, quality: Floats) -> dict[str, AnyArray]:
+def _read_gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, quality: Floats) -> _Arrays:
     return {
         "lon_deg": lon,
         "lat_deg": lat,
@@ -281,7 +282,7 @@ def _read_nmea(columns: Columns) -> Readings:
     )
 
 
-def find_utc_offset(readings: Readings) -> tuple[Finding, ...]:
+def find_utc_offset(readings: Readings) -> Findings:
     """Return the finding that the used UTC of a receiver's sentences is further from their headers than a transfer."""
     own_time_ns, stamps_ns = readings.own_time_ns, readings.header_ns
     if own_time_ns is None or stamps_ns is None or not (known := (own_time_ns > 0) & (stamps_ns > 0)).any():
@@ -293,7 +294,7 @@ def find_utc_offset(readings: Readings) -> tuple[Finding, ...]:
     return (make_finding("utc-differs-from-header", GNSS, offset_s=apart_s, remedies=remedies),)
 
 
-def _make_ground_velocity(velocity: Floats, variances: Floats, status: AnyArray | int = -1) -> dict[str, AnyArray]:
+def _make_ground_velocity(velocity: Floats, variances: Floats, status: AnyArray | int = -1) -> _Arrays:
     """Return the columns of velocities east, north, up (N, 3) and their variances."""
     axes = ("east", "north", "up")
     return {
@@ -434,7 +435,7 @@ def _read_imu(columns: Columns) -> Readings:
 _POSE = ("x_m", "y_m", "z_m", "quat_x", "quat_y", "quat_z", "quat_w")
 
 
-def _read_body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[dict[str, AnyArray], Floats]:
+def _read_body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[_Arrays, Floats]:
     """Return a twist's columns, null where it is not measured, and the twist as published, shape (N, 6)."""
     linear, angular = _read_vector(columns, f"{prefix}.linear"), _read_vector(columns, f"{prefix}.angular")
     twist = np.concatenate((linear, angular), -1)
@@ -477,7 +478,7 @@ def _read_twist_stamped(columns: Columns) -> Readings:
 def _read_command(columns: Columns) -> Readings:
     prefix = "twist." if "twist.linear.x" in columns else ""
     forward, yaw_rate = (columns[f"{prefix}{name}"].astype(float) for name in ("linear.x", "angular.z"))
-    values: dict[str, AnyArray] = {"forward_velocity_mps": forward, "yaw_rate_radps": yaw_rate}
+    values: _Arrays = {"forward_velocity_mps": forward, "yaw_rate_radps": yaw_rate}
     return _select_rows(columns, values, {"not_finite": ~np.isfinite(forward + yaw_rate)})
 
 
@@ -489,7 +490,7 @@ def _read_pose(columns: Columns) -> Readings:
         quat[:] = np.nan
     if np.all(place[:, 2] == place[:1, 2]):  # a map in the plane
         variances[:, 2] = NO_HEIGHT_M2
-    values: dict[str, AnyArray] = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
+    values: _Arrays = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
     values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), np.full(len(place), np.nan))
     values |= {f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))}
     values |= {f"quat_{c}": quat[:, i] for i, c in enumerate("xyzw")}

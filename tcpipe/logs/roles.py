@@ -33,7 +33,7 @@ from tcpipe.logs.topics import (
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity, is_corrected, make_rail_name
 from tcpipe.recipe.suggestions import RecipeFragment, suggest
 from tcpipe.robots import Profiles
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 NMEA_SENTENCE = "nmea_msgs/msg/Sentence"
@@ -93,7 +93,7 @@ class RoleAssignment:
     left_out: Mapping[str, str]
     transforms: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Roles that several topics could be used as, and these."""
 

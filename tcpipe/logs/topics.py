@@ -16,7 +16,7 @@ from typing import Any, Literal
 from tcpipe.errors import RecipeError, list_first
 from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.robots import GENERIC, Robot
-from tcpipe.tables.findings import Finding, Severity, Subject, make_finding
+from tcpipe.tables.findings import Finding, Findings, Severity, Subject, make_finding
 
 AutopilotKind = Literal["ulog", "dataflash"]
 """Logs of autopilots: PX4's and ArduPilot's."""
@@ -120,7 +120,7 @@ def _merge_damage(subject: Subject, places: Sequence[Damage]) -> Finding:
     )
 
 
-def split_notes(findings: Iterable[Finding]) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
+def split_notes(findings: Iterable[Finding]) -> tuple[Findings, Findings]:
     """Return the findings on losses, and the notes."""
     found = list(findings)
     return tuple(finding for finding in found if finding.severity != "note"), tuple(
@@ -249,7 +249,7 @@ MISSING = {"no-gnss": "gnss", "no-power": "power", "no-imu": "imu", "no-wheel-od
 """Role without which labels or checks are missing, by the code of the finding."""
 
 
-def find_missing_roles(roles: Collection[str]) -> tuple[Finding, ...]:
+def find_missing_roles(roles: Collection[str]) -> Findings:
     """Return a finding for each role that is not among ``roles`` and without which labels or checks are missing."""
     present = {*roles, "gnss"} if "pose" in roles else roles
     return tuple(make_finding(code, Subject("role", role)) for code, role in MISSING.items() if role not in present)

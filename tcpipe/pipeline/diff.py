@@ -18,7 +18,7 @@ from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.published_outputs import fetch_directory
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.columns import to_integers
-from tcpipe.tables.findings import Finding, Subject
+from tcpipe.tables.findings import Finding, Findings, Subject
 
 _LABELS = ("power_watt", "velocity_mps", "duration_s", "energy_joule")
 _STDS = ("power_std_watt", "velocity_std_mps", "duration_std_s", "energy_std_joule")
@@ -45,9 +45,9 @@ class Difference:
     changes: Mapping[str, Mapping[str, float]]
     """For every label and its σ: median and largest absolute change, of a label also in σ of the first
     (``largest_in_std``); over the samples of one run that share most of their time."""
-    findings_gone: tuple[Finding, ...]
+    findings_gone: Findings
     """Findings of the first, by code and subject, that the second lacks: its own, its runs' and its maps'."""
-    findings_new: tuple[Finding, ...]
+    findings_new: Findings
     differing: int
     """Number of samples that only one has, or that have other values, another split or another patch."""
     same: bool

@@ -21,7 +21,7 @@ from tcpipe.formats.parquet import make_storable, read_schema, write_parquet_row
 from tcpipe.logs.topics import split_notes
 from tcpipe.pipeline.log_sources import make_definitions_key
 from tcpipe.store import is_store
-from tcpipe.tables.findings import Finding
+from tcpipe.tables.findings import Findings
 from tcpipe.tables.levels import add_metadata, read_metadata
 
 INDEX = "export.json"
@@ -57,8 +57,8 @@ class ExportIndex:
 
     made_from: ExportOrigin
     topics: Mapping[str, IndexEntry]
-    damage: tuple[Finding, ...]
-    notes: tuple[Finding, ...]
+    damage: Findings
+    notes: Findings
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +79,8 @@ class Exported:
     out: Path
     status: Literal["done", "unchanged"]
     topics: tuple[ExportedTopic, ...]
-    damage: tuple[Finding, ...]
-    notes: tuple[Finding, ...]
+    damage: Findings
+    notes: Findings
     exit_code: int
     """3 where the log had lost something."""
 

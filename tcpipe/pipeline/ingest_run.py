@@ -34,7 +34,7 @@ from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
 from tcpipe.store import Store, name_run
 from tcpipe.tables.columns import encode_rows, number_column, to_floats, to_integers
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     RESULTS_VERSION,
@@ -76,8 +76,8 @@ class _Read:
     """The streams of a log, and findings on the log."""
 
     streams: Streams
-    damage: tuple[Finding, ...]
-    notes: tuple[Finding, ...]
+    damage: Findings
+    notes: Findings
     stored: RunFacts | None = None
     """The run of which these are the stored streams; None of streams that were read now."""
 

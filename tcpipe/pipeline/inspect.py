@@ -24,7 +24,7 @@ from tcpipe.pipeline.log_sources import find_remote_logs
 from tcpipe.pipeline.proposals import propose_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, find_named_runs, is_path, is_store
-from tcpipe.tables.findings import AFFECTED, Finding, Grade, Verdict
+from tcpipe.tables.findings import AFFECTED, Findings, Grade, Verdict
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class InspectedRun:
     run_id: str
     log: LogOrigin
     tags: Mapping[str, str]
-    notes: tuple[Finding, ...]
+    notes: Findings
     recipes: tuple[InspectedRecipe, ...]
 
 

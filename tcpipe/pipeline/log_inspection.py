@@ -27,7 +27,7 @@ from tcpipe.stages.proposals import find_proposals
 from tcpipe.stages.read import decide_roles, find_read_config
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import ClockStep
-from tcpipe.tables.findings import Finding, Subject, make_finding, omit, sort_findings
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding, omit, sort_findings
 
 _GAP_PERIODS, _GAP_NS = 3, 300_000_000
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
@@ -92,9 +92,9 @@ class InspectedLog:
     clock_steps: tuple[ClockStep, ...] | None = omit()
     problems: tuple[str, ...] = ()
     """Decisions that ingest needs, or why the log cannot be read."""
-    findings: tuple[Finding, ...] | None = omit()
-    damage: tuple[Finding, ...] | None = omit()
-    notes: tuple[Finding, ...] | None = omit()
+    findings: Findings | None = omit()
+    damage: Findings | None = omit()
+    notes: Findings | None = omit()
     recipe: str | None = omit()
     """Recipe of ``tcpipe init --from`` without the keys that the recipe has [TOML]."""
 

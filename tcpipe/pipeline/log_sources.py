@@ -28,7 +28,7 @@ from tcpipe.formats.logs.table_folders import (
 from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
 from tcpipe.formats.runs import LogSnapshot
 from tcpipe.logs.topics import Topic
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding
 
 _LONGEST_STEM_BYTES = 200
 
@@ -261,7 +261,7 @@ def recall_hash(source: LogSource, seen: LogSnapshot | None) -> LogSource:
     return replace(source, sha256=seen.sha256) if is_same and seen is not None else source
 
 
-def find_damaged_log(damage: Sequence[Finding], subject: Subject) -> tuple[Finding, ...]:
+def find_damaged_log(damage: Sequence[Finding], subject: Subject) -> Findings:
     """Return the finding that a log is damaged, which decides exit codes and can be acknowledged."""
     places = sum(finding.numbers.get("places_count", 1) for finding in damage)
     return (make_finding("log-damaged", subject, damage_count=places),) if damage else ()
@@ -273,7 +273,7 @@ def find_total_loss(topics: Iterable[Topic], damage: Sequence[Finding]) -> tuple
     return ("the log is damaged, and no message can be read",) if is_lost else ()
 
 
-def find_failure(log: str, error: str) -> tuple[Finding, ...]:
+def find_failure(log: str, error: str) -> Findings:
     """Return the finding that a log gave no run; ``error`` is the class of the error."""
     return (make_finding("log-failed", Subject("log", log), names={"error": error}),)
 

@@ -17,7 +17,7 @@ from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.runs import Call, LogFailure, RunFacts, find_problems, make_failure
 from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient, recall_hash
 from tcpipe.recipe import Recipe
-from tcpipe.tables.findings import Finding, Verdict, select_problems
+from tcpipe.tables.findings import Findings, Verdict, select_problems
 from tcpipe.tables.levels import DATA_MODEL_VERSION, RESULTS_VERSION
 
 R = TypeVar("R")
@@ -69,7 +69,7 @@ class IngestResult:
     """Run in the store; None if the log waits or failed."""
     verdict: Verdict | None = None
     """Findings of the run."""
-    causes: tuple[Finding, ...] = ()
+    causes: Findings = ()
     """Findings on why the log failed."""
     problems: tuple[str, ...] = ()
     """Why it failed, as lines."""
@@ -88,7 +88,7 @@ class IngestResult:
     """Where an internal error comes from."""
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> Findings:
         """On the run, or on the log that failed."""
         return self.run.findings if self.run else self.causes
 
@@ -191,7 +191,7 @@ class PlannedLog:
     """The ingestion of the log as it would be made now, where there is one."""
     failure: LogFailure | None = None
     """Why the log is not tried again."""
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     """Findings on its problems."""
 
     @property

@@ -30,7 +30,16 @@ from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.stages.read import decide_roles, find_read_config, read_run
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, StageFacts
-from tcpipe.tables.findings import Finding, Subject, Verdict, judge, make_finding, read_threshold, sort_findings
+from tcpipe.tables.findings import (
+    Finding,
+    Findings,
+    Subject,
+    Verdict,
+    judge,
+    make_finding,
+    read_threshold,
+    sort_findings,
+)
 from tcpipe.tables.levels import LabelledSegments
 
 WANTED_HZ: Mapping[str, float] = {
@@ -108,7 +117,7 @@ class Preflight:
     topics: tuple[RoleTopic, ...]
     problems: tuple[str, ...]
     """Why ingest would fail."""
-    findings: tuple[Finding, ...]
+    findings: Findings
     """Findings of ingest, and on topics that are too slow, missing or offset, the worst first."""
     verdict: Verdict
     losses: tuple[StoreLoss, ...]
@@ -160,7 +169,7 @@ def preflight(
         read = find_read_config(recipe, found.topics)
         roles = decide_roles(read, found.topics.values(), robot, known=load_profiles(recipe)).roles
         missing = tuple(find_missing(roles, read))
-        labelled, problems, causes = None, tuple[str, ...](), tuple[Finding, ...]()
+        labelled, problems, causes = None, tuple[str, ...](), Findings()
         try:
             streams = read_run(found, read, robot=robot, known=load_profiles(recipe))
             labelled = run_stages(streams, recipe.ingest, run_id="preflight")[2]
@@ -170,7 +179,7 @@ def preflight(
 
 
 def _summarize(
-    seen: InspectedLog, labelled: LabelledSegments | None, missing: tuple[Finding, ...], problems: tuple[str, ...]
+    seen: InspectedLog, labelled: LabelledSegments | None, missing: Findings, problems: tuple[str, ...]
 ) -> Preflight:
     report = labelled.info.report if labelled else NOTHING_FOUND
     expected_yield = _estimate_yield(labelled) if labelled else None

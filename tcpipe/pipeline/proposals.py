@@ -53,7 +53,7 @@ from tcpipe.stages.proposals import NO_VOLTAGE, NOMINAL, find_proposals, judge_f
 from tcpipe.stages.read import decide_roles, find_read_config, read_run
 from tcpipe.stages.read_sources import place_frames
 from tcpipe.store import is_store
-from tcpipe.tables.findings import Finding
+from tcpipe.tables.findings import Finding, Findings
 from tcpipe.tables.levels import Streams
 
 if TYPE_CHECKING:
@@ -584,7 +584,7 @@ def _scale_speed(lines: Sequence[ProposedLine], scale: float, why: str) -> list[
     return [*lines] if is_stated else [*lines, ProposedLine("tables.wheel_odometry", "units.linear_x", unit, why)]
 
 
-def _fuse_first_minute(log: Path, recipe: Recipe) -> tuple[Finding, ...]:
+def _fuse_first_minute(log: Path, recipe: Recipe) -> Findings:
     """Return the findings of the first minute of a log."""
     from tcpipe.stages.fuse import fuse_run  # noqa: PLC0415  kernels load only where there is work
 

@@ -24,7 +24,7 @@ from tcpipe.pipeline.plan import LOG_STATES, TO_DO, TROUBLE, IngestTask, LogStat
 from tcpipe.pipeline.problems import find_incomplete_maps, find_incomplete_runs, find_stale_outputs, make_missing
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
-from tcpipe.tables.findings import Finding
+from tcpipe.tables.findings import Findings
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7
@@ -60,7 +60,7 @@ class Status:
     """Logs by state."""
     groups: tuple[Group, ...]
     """By state and cause."""
-    problems: tuple[Finding, ...]
+    problems: Findings
     """Sources that cannot be read, runs that are not complete, calls that were killed, damaged documents,
     outputs that are out of date or whose last call failed."""
     gone: tuple[str, ...]

@@ -33,7 +33,7 @@ from tcpipe.stages.sample import Shifts
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
-from tcpipe.tables.findings import PREDICTED, Finding, Subject, Verdict, judge, make_finding, read_threshold
+from tcpipe.tables.findings import PREDICTED, Finding, Findings, Subject, Verdict, judge, make_finding, read_threshold
 from tcpipe.terrain.sampling import make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 
@@ -275,7 +275,7 @@ class Drives:
     model: str
     model_checksum: str
     drives: tuple[DriveCost, ...]
-    findings: tuple[Finding, ...]
+    findings: Findings
     verdict: Verdict
 
 

@@ -38,7 +38,16 @@ from tcpipe.robots import (
     parse_fields,
 )
 from tcpipe.tables.facts import PowerSign
-from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold, select_findings
+from tcpipe.tables.findings import (
+    Finding,
+    Findings,
+    Remedy,
+    Severity,
+    Subject,
+    make_finding,
+    read_threshold,
+    select_findings,
+)
 
 _LOG_TIME = "log_time_ns"
 _POWER = Subject("role", "power")
@@ -49,6 +58,9 @@ _SIGNS = ("drawn_negative", "drawn_positive")
 
 Rails = Mapping[str, list[RailReadings]]
 """By topic."""
+TopicRailReadings = dict[str, list[RailReadings]]
+Topics = Mapping[str, tuple[str, Columns]]
+"""Type and columns of each topic."""
 
 
 def _list_rails(rails: Rails) -> list[tuple[str, RailReadings]]:
@@ -69,7 +81,7 @@ class PowerReadings:
     """Power topics: ``rails`` have one row a message; without rails ``findings`` give the reason of rejection."""
 
     rails: Rails = field(default_factory=dict)
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     facts: PowerSign | None = None
     """None without power; its ``zero_amp`` is not subtracted yet."""
     averaging_unknown: bool = False
@@ -84,7 +96,7 @@ class PowerReadings:
 
 
 def read_power(
-    topics: Mapping[str, tuple[str, Columns]],
+    topics: Topics,
     known: Sequence[PowerSource],
     *,
     platform: str | None = None,
@@ -98,7 +110,7 @@ def read_power(
     ``topics``: message type and columns by topic; ``known``: tables of message types; ``platform``: the robot's; the
     rest are recipe keys.
     """
-    rails: dict[str, list[RailReadings]] = {}
+    rails: TopicRailReadings = {}
     sources: list[PowerSource] = []
     rejected: list[Finding] = []
     scaled: dict[str, list[PowerSource]] = {}
@@ -170,7 +182,7 @@ def _scale_source(source: PowerSource, factor: float) -> PowerSource:
     return replace(source, **{name: factor * getattr(source, name) for name in scales})
 
 
-def _compare_charges(topics: Mapping[str, tuple[str, Columns]], rails: Rails) -> float | None:
+def _compare_charges(topics: Topics, rails: Rails) -> float | None:
     """Return the integral of the current over the fall of the charge, of the topic whose charge contradicts it most."""
     ratios = []
     for topic, of_topic in rails.items():
@@ -201,8 +213,8 @@ _MIN_CORRELATION = 0.7
 
 def compare_second_meters(
     power: PowerReadings,
-    topics: Mapping[str, tuple[str, Columns]],
-    meters: Mapping[str, tuple[str, Columns]],
+    topics: Topics,
+    meters: Topics,
     known: Sequence[PowerSource],
     *,
     platform: str | None = None,
@@ -233,9 +245,7 @@ def _sum_watt(columns: Columns, rails: Sequence[RailReadings]) -> tuple[Floats, 
     return np.asarray(columns[_LOG_TIME], float)[known], watt[known]
 
 
-def _find_sides(
-    topics: Mapping[str, tuple[str, Columns]], sources: Sequence[PowerSource], rails: Rails, sign: int
-) -> Sides | None:
+def _find_sides(topics: Topics, sources: Sequence[PowerSource], rails: Rails, sign: int) -> Sides | None:
     """Return the currents of both sides: the two currents that one source adds, or two rails called left and right."""
     if len(sources) == 1 and len(fields_added := parse_fields(sources[0].current)) == 2:
         (topic,) = rails
@@ -368,7 +378,7 @@ def _unwrap_currents(rail: RailReadings) -> tuple[RailReadings, list[Finding]]:
     return replace(rail, current_amp=unwrap_currents(rail.current_amp, wraps_amp)), [found]
 
 
-def _pair_rails(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailReadings]]:
+def _pair_rails(rails: TopicRailReadings) -> TopicRailReadings:
     """Give the one rail without current and the one without voltage a common name: they are one rail on two topics."""
     without_voltage = [rail.name for _, rail in _list_rails(rails) if not np.isfinite(rail.voltage_volt).any()]
     without_current = [rail.name for _, rail in _list_rails(rails) if not np.isfinite(rail.current_amp).any()]
@@ -421,13 +431,13 @@ def _find_too_few(topic: str, log_time_ns: Floats) -> list[Finding]:
     )
 
 
-def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[str, list[RailReadings]], list[Finding]]:
+def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[TopicRailReadings, list[Finding]]:
     """Return the rails with NaN in rows without a measurement, and findings: their number, or rejection of the power.
 
     A row is one measurement: if its voltage or current is missing or implausible, both are excluded. Rows that a driver
     sends before the sensor starts and after it stops are not counted.
     """
-    kept: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
+    kept: TopicRailReadings = {topic: [] for topic in rails}
     findings = []
     for topic, rail in _list_rails(rails):
         volt, amp, names = rail.voltage_volt, rail.current_amp, {"rail": rail.name}
@@ -450,10 +460,10 @@ def _exclude_rows(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[dict[s
 
 
 def _undo_overflows(
-    rails: dict[str, list[RailReadings]], log_times: Mapping[str, Floats]
-) -> tuple[dict[str, list[RailReadings]], list[Finding]]:
+    rails: TopicRailReadings, log_times: Mapping[str, Floats]
+) -> tuple[TopicRailReadings, list[Finding]]:
     """Return rails without overflow of signed currents, and findings; reject power if the voltage contradicts them."""
-    whole: dict[str, list[RailReadings]] = {topic: [] for topic in rails}
+    whole: TopicRailReadings = {topic: [] for topic in rails}
     findings, are_clear = [], True
     for topic, rail in _list_rails(rails):
         current_amp, span_amp, is_clear = undo_overflow(rail.current_amp)
@@ -485,7 +495,7 @@ def _correlate_voltage(rails: Rails, log_times: Mapping[str, Floats]) -> float:
 
 def _sign(
     rails: Rails, log_times: Mapping[str, Floats], sources: list[PowerSource], given: CurrentSign
-) -> tuple[int, tuple[Finding, ...], str]:
+) -> tuple[int, Findings, str]:
     """Return the sign of a drawn current (0 if the record contradicts its type), findings, and the sign's source."""
     if given != "auto":
         return (1 if given == "drawn_positive" else -1), (), f"{given} (recipe)"
@@ -502,7 +512,7 @@ def _sign(
     return _sign_by_charge(sign, net, sources)
 
 
-def _sign_by_charge(sign: int, net: float, sources: Sequence[PowerSource]) -> tuple[int, tuple[Finding, ...], str]:
+def _sign_by_charge(sign: int, net: float, sources: Sequence[PowerSource]) -> tuple[int, Findings, str]:
     """Return the result of `_sign` if types define no sign: if charge flows both ways, ROS's convention or no power."""
     if sign < 0:
         return -1, (), "drawn_negative (mean, as ROS has it)"

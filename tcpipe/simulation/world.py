@@ -100,6 +100,9 @@ class Wave:
     phase_rad: float
 
 
+Waves = tuple[Wave, ...]
+
+
 def draw_waves(
     seed: int,
     *,
@@ -107,7 +110,7 @@ def draw_waves(
     total: float,
     wavelength_m: tuple[float, float],
     direction_rad: tuple[float, float] = (0.0, np.pi),
-) -> tuple[Wave, ...]:
+) -> Waves:
     """Return plane waves of random direction, phase, log-uniform wavelength; squared amplitudes sum to ``total``²."""
     rng = np.random.default_rng(seed)
     amplitude = total * np.sqrt(2.0 / count)
@@ -165,13 +168,13 @@ class Surface:
     """The states of a site's ground; the waves of each have a deviation of 1 together."""
 
     looks: dict[int, SurfaceEffect]  # by class id; a class that is not named has none
-    wetness: tuple[Wave, ...]
-    cover: tuple[Wave, ...]
-    roughness: tuple[Wave, ...]
-    grain: tuple[Wave, ...]
-    bumps: tuple[Wave, ...]
-    ridges: tuple[Wave, ...]
-    noise: tuple[Wave, ...]
+    wetness: Waves
+    cover: Waves
+    roughness: Waves
+    grain: Waves
+    bumps: Waves
+    ridges: Waves
+    noise: Waves
     map_noise_std_m: float  # of the height raster, which costs nothing
     swing: float  # by how much grain, bumps and ridges grow where their state is 1, as a fraction
 
@@ -288,11 +291,11 @@ class World:
     site: Site
     base_m: float  # height above the geoid without hills [m]
     hills: tuple[Hill, ...] = ()
-    waves: tuple[Wave, ...] = ()  # ripples of the height [m]
+    waves: Waves = ()  # ripples of the height [m]
     regions: tuple[Ellipse | Band, ...] = ()  # later ones lie on earlier ones; the rest is grass
     holes: tuple[Ellipse, ...] = ()  # where the rasters hold nothing (the white areas of the paper's figure 1)
-    texture: tuple[Wave, ...] = ()  # ripples of the brightness, as a fraction
-    resistance: tuple[Wave, ...] = field(default=())
+    texture: Waves = ()  # ripples of the brightness, as a fraction
+    resistance: Waves = field(default=())
     """Ripples of the rolling resistance that no map shows, as a fraction."""
     surface: Surface | None = omit()
     """Variation of the ground of a class from metre to metre; None: everywhere the same."""

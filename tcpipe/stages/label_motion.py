@@ -31,7 +31,7 @@ from tcpipe.power.rails import Rail, Rule, integrate_recorded_energy
 from tcpipe.tables.bits import DropReason, Quality, flag_name
 from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_numbers
 from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo
 
 Arrays = dict[str, Floats]
@@ -260,7 +260,7 @@ def _make_budget(energy_joule: Floats, variance_j2: Sequence[Mapping[str, Floats
     )
 
 
-def find_label_findings(facts: LabelFacts, rails: Iterable[Rail]) -> tuple[Finding, ...]:
+def find_label_findings(facts: LabelFacts, rails: Iterable[Rail]) -> Findings:
     """Return what was observed while labelling by all rails of a run."""
     findings = []
     if facts.quality["low_power_rate"] and facts.segments_without_power < facts.segments:

@@ -18,7 +18,7 @@ from tcpipe.robots import MAX_PLAUSIBLE_MPS
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import MaskFacts
-from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Findings, Remedy, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import MASKED_TRACK, TRACK, MaskedTrack, Track, add_findings
 
 
@@ -81,7 +81,7 @@ def mask_track(
     return MaskedTrack(masked, add_findings(track.info, findings, replace(track.info.report.facts, mask=facts)))
 
 
-def find_outside_windows(track: Track, windows: Sequence[TimeWindow]) -> tuple[Mask, tuple[Finding, ...]]:
+def find_outside_windows(track: Track, windows: Sequence[TimeWindow]) -> tuple[Mask, Findings]:
     """Return the rows that the windows of this run drop, and a finding if a window has no row.
 
     Rows are dropped inside a window that drops and, if any window keeps, outside all windows that keep.
@@ -159,7 +159,7 @@ class SpeedLimit:
     limit_mps: float | None
     top_mps: float
     held: float
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
 
 
 def find_speed_limit(rows: MotionRows, config: MaskConfig, *, max_velocity_mps: float | None) -> SpeedLimit:
@@ -224,7 +224,7 @@ _DISPLACEMENTS = [c.name for c in TRACK.columns if c.name.startswith("displaceme
 
 def find_gaps(
     track: Track, rows: MotionRows, *, chord_m: float, config: MaskConfig, max_plausible_mps: float
-) -> tuple[dict[str, Mask], tuple[Finding, ...]]:
+) -> tuple[dict[str, Mask], Findings]:
     """Return the rows that are in a gap by cause, and the findings; a row may have several causes.
 
     An error of scale that is common to the whole run makes no segment worse than the next: it is no part of a chord's
@@ -301,7 +301,7 @@ _WINDOW_S = 60.0
 _DRIVES_MPS = 0.1
 
 
-def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: float) -> tuple[Mask, tuple[Finding, ...]]:
+def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: float) -> tuple[Mask, Findings]:
     """Return the rows above a limit [m/s] by velocity or by the step between two rows (jumps excepted), and findings.
 
     Raises `FusionError`: the moving median of the speed, over a minute of driving, exceeds the limit.

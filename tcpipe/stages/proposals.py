@@ -22,7 +22,7 @@ from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import Keys, format_first, suggest
 from tcpipe.robots import PowerSource, Profiles
 from tcpipe.stages.message_arrays import LogReader, make_message_arrays
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _GRAVITY_MPS2 = UNITS["m/s2"]["g"]
@@ -30,9 +30,7 @@ _UNSETTLED: Keys = {"sign": "auto", "averaging_unknown": True}
 """Keys of a current that its name does not determine."""
 
 
-def find_proposals(
-    log: LogReader, assignment: RoleAssignment, config: ReadConfig, known: Profiles
-) -> tuple[Finding, ...]:
+def find_proposals(log: LogReader, assignment: RoleAssignment, config: ReadConfig, known: Profiles) -> Findings:
     """Return proposals for roles without a topic that the recipe does not mention. The log is read once."""
     readable = [topic for topic in log.topics.values() if topic.problem is None and topic.message_count != 0]
     free = [of for of in readable if of.name not in config.ignore_topics and not of.name.startswith(OVERLAY)]

@@ -20,7 +20,7 @@ from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Profiles
 from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_texts
-from tcpipe.tables.findings import Finding, Severity, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Findings, Severity, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import STREAMS
 
 
@@ -148,7 +148,7 @@ def read_rail_power(rail: RailReadings, times: Columns, columns: Columns) -> tup
 
 def add_averaging(
     power: PowerReadings, streams: Mapping[str, pa.Table], config: ReadConfig
-) -> tuple[PowerReadings, tuple[Finding, ...]]:
+) -> tuple[PowerReadings, Findings]:
     """Return the power with whether its values are means over their period, and the finding where that is assumed."""
     counts = any(rail.counter is not None for rails in power.rails.values() for rail in rails)
     if power.facts is not None and config.power_averaged != "auto" and not counts:

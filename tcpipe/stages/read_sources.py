@@ -34,7 +34,7 @@ from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import Arrays, LogReader, read_transforms
 from tcpipe.stages.read_power import list_second_meters, read_power_of_topics, select_power_rows
 from tcpipe.tables.columns import to_floats
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor
 
 
@@ -281,7 +281,7 @@ _POSE_ROLE = Subject("role", _POSE)
 
 def place_pose(
     streams: Mapping[str, pa.Table], assignment: RoleAssignment, config: ReadConfig
-) -> tuple[dict[str, pa.Table], str, tuple[Finding, ...]]:
+) -> tuple[dict[str, pa.Table], str, Findings]:
     """Return the streams with the pose in longitude and latitude, the CRS of these, and findings.
 
     The CRS is that of ``read.pose_crs``, or ``read.gnss_crs`` if the former states its own datum shift.

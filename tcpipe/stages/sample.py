@@ -13,7 +13,7 @@ from tcpipe.recipe import SampleConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.bits import Loss
 from tcpipe.tables.columns import read_ends_m, read_lonlat_deg, to_floats
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Findings, Subject, make_finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.sampling import (
@@ -51,7 +51,7 @@ class Sampled:
     footprint_xy_m: Floats
     footprint_lonlat_deg: Floats
     lost_by: NDArray[np.uint32]
-    findings: tuple[Finding, ...]
+    findings: Findings
 
 
 def sample_segments(
@@ -183,7 +183,7 @@ def sum_losses(arc_length_m: Floats, lost_by: NDArray[np.uint32]) -> dict[Loss, 
     return {loss: float(arc_length_m[lost_by == loss].sum()) for loss in _LOSSES}
 
 
-def _find_in_map(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[Finding, ...]:
+def _find_in_map(source: MapReader, config: SampleConfig, projection: Projection) -> Findings:
     """Return the findings on a map itself: its datum, and the size of its pixels."""
     subject, patch_pixel_m = Subject("map", source.name), config.patch_m / config.patch_px
     map_pixel_m = choose_level(source, patch_pixel_m).grid.pixel_size_m

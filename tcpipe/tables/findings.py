@@ -174,6 +174,9 @@ class Finding:
         return hash((self.code, self.subject, self.span_s, frozenset(self.numbers.items())))
 
 
+Findings: TypeAlias = tuple[Finding, ...]
+
+
 def make_finding(
     code: str,
     subject: Subject,
@@ -233,7 +236,7 @@ def select_problems(findings: Iterable[Finding]) -> list[Finding]:
 class StageReport(Generic[F]):
     """Observations of a stage, or of all stages so far: findings, and facts that the next stages and the pages use."""
 
-    findings: tuple[Finding, ...]
+    findings: Findings
     facts: F
 
 
@@ -256,9 +259,9 @@ class Verdict:
     position: Grade = "usable"
     time: Grade = "usable"
     energy: Grade = "usable"
-    reasons: tuple[Finding, ...] = ()
+    reasons: Findings = ()
     confirmed_by: Mapping[Affected, tuple[Witness, ...]] = field(default_factory=dict)
-    labels: tuple[Finding, ...] = ()
+    labels: Findings = ()
     catalogue: str = field(default_factory=read_catalogue_version)
     """Version of the catalogue that judged."""
 

@@ -20,7 +20,7 @@ from pyproj.transformer import TransformerGroup
 
 from tcpipe.arrays import Floats
 from tcpipe.errors import MapError
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 
 MAX_SCALE_ERROR = 0.01
 """A CRS whose unit is further from a metre of ground than this share is not metric enough to cut patches in."""
@@ -167,7 +167,7 @@ class Projection:
             ) from error
         return np.stack([np.asarray(x, float), np.asarray(y, float)], axis=-1)
 
-    def find_rough_shift(self, subject: Subject) -> tuple[Finding, ...]:
+    def find_rough_shift(self, subject: Subject) -> Findings:
         """Return a finding if the two datums differ and their shift is rough, unknown or given by a file."""
         source, target = (CRS(crs.geodetic_crs) for crs in (self.source, self.target))
         if source.datum == target.datum:

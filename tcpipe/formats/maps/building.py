@@ -29,7 +29,7 @@ from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import PICTURE_PX, SHARD_PX, MapWriter
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding, read_threshold
 from tcpipe.terrain.layers import (
     MAX_ID,
     PAPER_LAYERS,
@@ -233,7 +233,7 @@ def _refuse_empty(layers: Mapping[str, LayerSource]) -> None:
         raise MapError(*problems)
 
 
-def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -> tuple[Finding, ...]:
+def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -> Findings:
     findings: list[Finding] = []
     least = read_threshold("layer-covers-little", "min_share_of_height_fraction") * covered["height"]
     for role, layer in layers.items():
@@ -245,7 +245,7 @@ def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -
     return tuple(findings)
 
 
-def _find_assumed(terrain: LayerSource | None) -> tuple[Finding, ...]:
+def _find_assumed(terrain: LayerSource | None) -> Findings:
     """Return the finding, if any, that terrain values are read as the paper's classes although nothing names them."""
     values = [] if terrain is None else terrain.values
     known = [f"{entry.id} as {entry.name}" for entry in PAPER_SCHEME.table.classes if entry.id in values]

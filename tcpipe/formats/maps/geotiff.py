@@ -35,7 +35,7 @@ from tcpipe.arrays import AnyArray, Bytes, Floats, Mask
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.maps.map_facts import read_value_names
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Findings, Subject, make_finding
 from tcpipe.terrain.layers import LUMA_RGB
 from tcpipe.terrain.target_grid import MapGrid
 
@@ -124,7 +124,7 @@ class Tile:
     cols: int
     kind: str
     """Type and bands, which the tiles of one layer share."""
-    findings: tuple[Finding, ...]
+    findings: Findings
     names: Mapping[int, str]
     """Names of values, from the raster attribute table or the category names; empty without such names."""
     driver: str
@@ -369,7 +369,7 @@ def _refuse_unplaced(dataset: Any, path: Path) -> None:
         raise MapError(f"{path}: its georeference has pixels without area")
 
 
-def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[int, ...], tuple[Finding, ...]]:
+def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[int, ...], Findings]:
     subject, file = Subject("layer", role), {"file": path.name}
     colours = {colour: band for band, colour in reversed(list(enumerate(dataset.colorinterp, 1)))}
     plain = [band for band, colour in enumerate(dataset.colorinterp, 1) if colour != ColorInterp.alpha]
@@ -409,7 +409,7 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
 
 def _read_scaling(
     dataset: Any, path: Path, role: str, use: Use, bands: tuple[int, ...]
-) -> tuple[tuple[float, float], tuple[Finding, ...]]:
+) -> tuple[tuple[float, float], Findings]:
     """Return scale and offset to metres, numbers or grey; for grey and classes, a finding that tags were ignored."""
     scale, offset = dataset.scales[bands[0] - 1], dataset.offsets[bands[0] - 1]
     if use == "numbers":

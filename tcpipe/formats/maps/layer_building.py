@@ -20,7 +20,7 @@ from tcpipe.arrays import AnyArray, Bytes, Floats, Ints, Mask
 from tcpipe.errors import MapError
 from tcpipe.formats.geojson import shorten_problems
 from tcpipe.formats.maps.geotiff import COLOUR_USES, OpenFile, Tile, Use, read_tile, read_window
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding, read_threshold
 from tcpipe.terrain.layers import PAPER_LAYERS, ClassScheme, Layer, Pixels
 from tcpipe.terrain.projection import Projection, parse_crs
 from tcpipe.terrain.resampling import mean, resample_bilinear, resample_majority
@@ -41,7 +41,7 @@ class Raster:
     unit: str
     georeference: Georeference
     """Where it lies; its name, for messages, is the path, and how many more there are."""
-    findings: tuple[Finding, ...]
+    findings: Findings
     """One a code, of the first tile that has it."""
     names: Mapping[int, str]
     tiles: tuple[Tile, ...]
@@ -351,7 +351,7 @@ class RasterLayer:
         """The values that were found, if the class table maps each value to itself."""
         return sorted({*(np.flatnonzero(self.tally.by_class[1:]) + 1).tolist(), *self.tally.unnamed})
 
-    def list_findings(self) -> tuple[Finding, ...]:
+    def list_findings(self) -> Findings:
         """Return the raster's findings: rough datum shift, values without a class, isolated values, narrow range."""
         subject = Subject("layer", self.layer.name)
         rough = self.projection.find_rough_shift(subject) if self.projection else ()

@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 from xml.etree.ElementTree import Element, fromstring
 
 from tcpipe.formats.json_files import parse_typed, to_plain
-from tcpipe.tables.findings import Finding, omit
+from tcpipe.tables.findings import Findings, omit
 from tcpipe.terrain.layers import (
     PAPER_LAYERS,
     ClassTable,
@@ -46,7 +46,7 @@ class MapFacts:
     """Share of each terrain class among the pixels that have a class."""
     class_shares: Mapping[str, Mapping[str, float]] = omit({})
     """The same of the user's own layers."""
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = ()
     classes_from: str
     """``file``, ``names`` of the terrain raster's values, ``store`` or ``default``."""
     inputs: MapInputs

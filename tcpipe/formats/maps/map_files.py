@@ -41,6 +41,7 @@ from tcpipe.formats.place import prove_files
 from tcpipe.formats.published_outputs import FetchedShards
 from tcpipe.formats.zarr_arrays import (
     DESCRIPTION,
+    Shape,
     ShardedArray,
     add_array,
     consolidate_metadata,
@@ -228,9 +229,6 @@ def _open_picture(path: Path, shape: tuple[int, int, int], fetched: FetchedShard
     return open_sharded(
         path, shape=shape, chunk_shape=shape, shard_shape=shape, dtype=np.dtype(np.uint8), fill=0, fetched=fetched
     )
-
-
-Shape = tuple[int, ...]
 
 
 def _shape_array(whole: MapGrid, factor: int) -> tuple[Shape, Shape, Shape]:

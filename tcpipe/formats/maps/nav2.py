@@ -144,6 +144,7 @@ def _make_orientations(xy_m: Floats) -> list[Json]:
 
 
 _EDGES = ("LineString", "MultiLineString")
+Document = Mapping[str, Json]
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,9 +154,9 @@ class RouteEdge:
     edge_id: int
     start: int
     end: int
-    feature: Mapping[str, Json]
+    feature: Document
 
-    def add_metadata(self, values: Mapping[str, Json]) -> Mapping[str, Json]:
+    def add_metadata(self, values: Document) -> Document:
         """Return the feature with more metadata."""
         properties = _get(self.feature, "properties")
         return {**self.feature, "properties": {**properties, "metadata": {**_get(properties, "metadata"), **values}}}
@@ -165,7 +166,7 @@ class RouteEdge:
 class RouteGraph:
     """A graph: the file without features, its features except edges, nodes (x, y [m] by id), and edges in order."""
 
-    document: Mapping[str, Json]
+    document: Document
     others: Sequence[Json]
     nodes: Mapping[int, tuple[float, float]]
     edges: tuple[RouteEdge, ...]
@@ -183,7 +184,7 @@ class RouteGraph:
             made.append(RouteEdge(edge_id, start, end, document))
         return made
 
-    def make_document(self, edges: Sequence[Mapping[str, Json]]) -> dict[str, Json]:
+    def make_document(self, edges: Sequence[Document]) -> dict[str, Json]:
         """Return the file with other edges."""
         return {**self.document, "features": [*self.others, *edges]}
 
@@ -228,7 +229,7 @@ def _read_node(feature: Json, problems: list[str]) -> Iterator[tuple[int, tuple[
         yield node, (numbers[0], numbers[1])
 
 
-def _read_edge(feature: Mapping[str, Json], nodes: Container[int], problems: list[str]) -> Iterator[RouteEdge]:
+def _read_edge(feature: Document, nodes: Container[int], problems: list[str]) -> Iterator[RouteEdge]:
     """Yield an edge, or add what is wrong with it to ``problems``."""
     properties = _get(feature, "properties")
     ids = [value for name in ("id", "startid", "endid") if _is_id(value := properties.get(name))]
@@ -240,7 +241,7 @@ def _read_edge(feature: Mapping[str, Json], nodes: Container[int], problems: lis
     yield RouteEdge(ids[0], ids[1], ids[2], feature)
 
 
-def _get(feature: Json, name: str) -> Mapping[str, Json]:
+def _get(feature: Json, name: str) -> Document:
     value = feature.get(name) if isinstance(feature, dict) else None
     return value if isinstance(value, dict) else {}
 

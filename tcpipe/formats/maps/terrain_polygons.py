@@ -21,7 +21,7 @@ from tcpipe.formats.geojson import PolygonFeature, read_polygons, shorten_proble
 from tcpipe.formats.maps.geotiff import burn_polygons
 from tcpipe.formats.maps.layer_building import Tally, label_files
 from tcpipe.splits.regions import project_near
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 from tcpipe.terrain.layers import ClassScheme, Layer, Pixels, make_paper_layers, name_key
 from tcpipe.terrain.projection import Projection, compute_area
 from tcpipe.terrain.target_grid import MapGrid
@@ -57,7 +57,7 @@ class PolygonLayer:
     grid: MapGrid
     polygons: NDArray[np.object_]
     ids: Bytes
-    findings: tuple[Finding, ...]
+    findings: Findings
     values: Sequence[int]
     """Numbers that stand for classes in the file, in place of names."""
     _tree: shapely.STRtree = field(repr=False)
@@ -76,7 +76,7 @@ class PolygonLayer:
         kept = ~shapely.is_empty(polygons)
         return burn_polygons(polygons[kept], self.ids[drawn][kept], part)
 
-    def list_findings(self) -> tuple[Finding, ...]:
+    def list_findings(self) -> Findings:
         """Return what was observed when they were placed."""
         return self.findings
 
@@ -193,7 +193,7 @@ def _project_polygons(
     )
 
 
-def _find_overlaps(polygons: NDArray[np.object_], ids: Bytes, scheme: ClassScheme) -> tuple[Finding, ...]:
+def _find_overlaps(polygons: NDArray[np.object_], ids: Bytes, scheme: ClassScheme) -> Findings:
     """Return the ground that polygons of different classes share; of many or detailed ones only some are compared."""
     tree, shared_m2, worst_m2, left = shapely.STRtree(polygons), 0.0, 0.0, _LOOKED_AT
     names: dict[str, str] = {}

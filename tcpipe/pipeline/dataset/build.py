@@ -34,7 +34,7 @@ from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Finding, is_problem, select_problems
+from tcpipe.tables.findings import Finding, Findings, is_problem, select_problems
 from tcpipe.tables.options import as_function
 
 logger = logging.getLogger("tcpipe")
@@ -48,7 +48,7 @@ class BuildResult:
     """Its directory, or its URL in a bucket."""
     status: str
     """``done``, ``unchanged``, or, of a dry run, ``planned``."""
-    findings: tuple[Finding, ...]
+    findings: Findings
     """Findings of the dataset itself, with excluded runs and empty splits."""
     card: DatasetCard | None = None
     """None for a dry run."""
@@ -151,7 +151,7 @@ class _Job:
 
     marks: BuildOptions
     inputs: ChosenInputs
-    left_out: tuple[Finding, ...]
+    left_out: Findings
     """On excluded runs."""
     known: DatasetCard | None
     """Card of the existing dataset at the output, or None."""
@@ -272,7 +272,7 @@ def _find_foreign_files(place: Location, card: DatasetCard | None) -> tuple[str,
 
 def _find_left_out(
     inputs: ChosenInputs, known: DatasetCard | None, options: BuildOptions, min_runs: int | None
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return findings on excluded runs, as notes if ``min_runs`` are enough; `DatasetError` if there are too few."""
     chosen = inputs.chosen
     before = () if known is None or known.without_coordinates else known.runs

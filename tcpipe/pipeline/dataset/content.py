@@ -50,7 +50,7 @@ from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, hash_ranks
 from tcpipe.stages.sample import Sampled, place_segments, sum_losses
 from tcpipe.tables.bits import Loss, flag_name
 from tcpipe.tables.columns import make_points, read_lonlat_deg, to_floats, to_integers
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.terrain.layers import PAPER_CLASSES
 from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, parse_crs
@@ -169,7 +169,7 @@ class Content:
     registrations: Sequence[tuple[MapRegistration, ...]]
     """By map, one for each run."""
     covariates: tuple[Covariate, ...]
-    findings: tuple[Finding, ...]
+    findings: Findings
 
 
 def gather_content(directory: Path, inputs: ChosenInputs, options: BuildOptions, jobs: int) -> Content:

@@ -41,7 +41,7 @@ from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
 from tcpipe.store import Store
 from tcpipe.tables.columns import encode_rows, number_column, to_floats, to_integers
-from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
+from tcpipe.tables.findings import Finding, Findings, Remedy, Subject, make_finding
 from tcpipe.tables.levels import RESULTS_VERSION, TABLES_VERSION
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class ChosenInputs:
     again: Mapping[str, Mask]
     """By run: segments that another run has too."""
     chosen: SelectedRuns
-    findings: tuple[Finding, ...]
+    findings: Findings
     """On the choice of runs."""
 
     @property
@@ -261,7 +261,7 @@ class _SegmentPositions:
     lonlat_deg: Floats
 
 
-def remove_duplicates(runs: Sequence[StoredRun]) -> tuple[tuple[StoredRun, ...], dict[str, Mask], tuple[Finding, ...]]:
+def remove_duplicates(runs: Sequence[StoredRun]) -> tuple[tuple[StoredRun, ...], dict[str, Mask], Findings]:
     """Return the runs, by id, without second logs of a drive; of two, the first by id stays.
 
     Also, by run, marks of the segments that an earlier run has, too; and findings. ``runs`` are all of one recipe.

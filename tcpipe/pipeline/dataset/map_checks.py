@@ -21,7 +21,7 @@ from tcpipe.robust import estimate_shorth
 from tcpipe.stages.sample import Sampled, Shifts
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
-from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
+from tcpipe.tables.findings import Finding, Findings, Subject, make_finding, read_threshold
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.registration import REACH_M, HeightScale, Registration, register_track
 from tcpipe.terrain.sampling import find_classes_at
@@ -123,7 +123,7 @@ def _describe_scale(scale: HeightScale, run_id: str, source: MapFile) -> str:
     )
 
 
-def _find_shift(found: Registration, run_id: str, name: str, *, is_applied: bool) -> tuple[Finding, ...]:
+def _find_shift(found: Registration, run_id: str, name: str, *, is_applied: bool) -> Findings:
     """Return the finding, if any, that the map is shifted against the track, or that the run was moved."""
     is_far = found.significant and found.shift_m > read_threshold("map-shifted", "min_shift_m")
     if not is_far and not is_applied:
@@ -145,7 +145,7 @@ def _find_shift(found: Registration, run_id: str, name: str, *, is_applied: bool
     return (finding,)
 
 
-def _find_other_heights(found: Registration, expected_m: float, run_id: str, name: str) -> tuple[Finding, ...]:
+def _find_other_heights(found: Registration, expected_m: float, run_id: str, name: str) -> Findings:
     """Return the finding, if any, that heights of map and track differ too much."""
     subject, names = Subject("run", run_id), {"map": name}
     if found.scale.is_off() or found.scale.is_wrong():

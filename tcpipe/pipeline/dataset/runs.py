@@ -25,7 +25,7 @@ from tcpipe.robots import GENERIC
 from tcpipe.store import Store
 from tcpipe.tables.bits import Loss, flag_name
 from tcpipe.tables.columns import to_floats
-from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
+from tcpipe.tables.findings import Finding, Findings, Remedy, Subject, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LABELLED_SEGMENTS, LABELS, Sensor
 
 logger = logging.getLogger("tcpipe")
@@ -39,11 +39,11 @@ class SelectedRuns:
     """Runs of one robot and recipe, and findings on excluded ones."""
 
     runs: tuple[StoredRun, ...]
-    missing: tuple[Finding, ...]
+    missing: Findings
     """On each matching run that was ingested in another way."""
-    damaged: tuple[Finding, ...]
+    damaged: Findings
     """On each run whose files were changed or lost."""
-    findings: tuple[Finding, ...]
+    findings: Findings
     """On superseded runs."""
 
 
@@ -160,7 +160,7 @@ def _suggest_logs(rows: Iterable[RunFacts], run_ids: Iterable[str]) -> str:
 
 def find_gone_runs(
     before: Sequence[RunSource], chosen: SelectedRuns, *, robot: str | None, tags: Mapping[str, str]
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Return a finding on each matching run of the replaced dataset that the store no longer has."""
     excluded = (*chosen.missing, *chosen.damaged, *chosen.findings)
     here = {*(run.run_id for run in chosen.runs), *(finding.subject.name for finding in excluded)}

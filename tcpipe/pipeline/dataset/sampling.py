@@ -23,7 +23,7 @@ from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled, Shifts, check_same_layers, sample_on_maps
 from tcpipe.tables.columns import to_floats
-from tcpipe.tables.findings import Finding
+from tcpipe.tables.findings import Findings
 from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.layers import Layer, join_layers, sort_layers
 from tcpipe.terrain.sampling import Patches
@@ -137,7 +137,7 @@ def sample_all_segments(
     sample = partial(_sample_batch, maps=maps, config=config, gnss_crs=gnss_crs, shifts=shifts, spool=spool)
     lost_by, slots = (make_mapped_array(directory, (segments.num_rows,), kind) for kind in (np.uint32, np.int64))
     counts, columns = [0] * len(rows), dict[str, AnyArray]()
-    findings: dict[int, tuple[Finding, ...]] = {}
+    findings: dict[int, Findings] = {}
     meter = Meter("sampling", segments.num_rows)
     try:
         with closing(run_all(sample, batches, jobs=jobs)) as outcomes:

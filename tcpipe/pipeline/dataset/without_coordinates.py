@@ -21,7 +21,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import LOCAL_PLACES
 from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
 from tcpipe.tables.facts import HeldOut
-from tcpipe.tables.findings import Finding, Subject, read_catalogue
+from tcpipe.tables.findings import Finding, Findings, Subject, read_catalogue
 from tcpipe.tables.levels import COORDINATES
 
 _ENDS = ("start", "end")
@@ -174,7 +174,7 @@ def make_publication(content: Content, inputs: ChosenInputs, *, patch_m: float) 
     )  # fmt: skip
 
 
-def keep_public(findings: Iterable[Finding], runs: Mapping[str, str]) -> tuple[Finding, ...]:
+def keep_public(findings: Iterable[Finding], runs: Mapping[str, str]) -> Findings:
     """Return findings with the fields that the catalogue calls public; ``runs`` are public names of runs."""
     kept = list[Finding]()
     for finding in findings:
