@@ -86,23 +86,6 @@ class PolygonGeometry:
     coordinates: tuple[tuple[tuple[float | tuple[float, ...], ...], ...], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Feature:
-    """A polygon feature as it is written: rings to the right-hand rule, lon before lat."""
-
-    properties: Mapping[str, str | float | None]
-    geometry: PolygonGeometry
-    type: str = "Feature"
-
-
-@dataclass(frozen=True, slots=True)
-class FeatureCollection:
-    """A GeoJSON file as it is written."""
-
-    features: tuple[Feature, ...]
-    type: str = "FeatureCollection"
-
-
 def read_polygons(path: Path, *, is_terrain: bool = False) -> tuple[list[PolygonFeature], list[str]]:
     """Read the polygon features of a file in their order, and one line for every unsound geometry.
 

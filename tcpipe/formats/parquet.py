@@ -251,21 +251,6 @@ def read_row_count(path: Path) -> int:
         return int(pq.read_metadata(path).num_rows)
 
 
-def read_range(path: Path, column: str) -> tuple[int, int]:
-    """Return the lowest and the highest value of a column of whole numbers, from the statistics in the footer.
-
-    `StoreError` where the file has none.
-    """
-    with _convert_damage(path):
-        about = pq.read_metadata(path)
-        groups = [about.row_group(index) for index in range(about.num_row_groups)]
-        at = about.schema.to_arrow_schema().get_field_index(column)
-        found = [group.column(at).statistics for group in groups if at >= 0 and group.num_rows]
-    if not found or not all(statistics is not None and statistics.has_min_max for statistics in found):
-        raise StoreError(f"{path}: has no statistics of {column}")
-    return min(int(statistics.min) for statistics in found), max(int(statistics.max) for statistics in found)
-
-
 _WGS84 = "EPSG:4326"
 
 

@@ -1,6 +1,5 @@
 """TOML files: recipes, read, checked (all errors together) and written with comments; the package's robot profiles."""
 
-import logging
 import os
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -16,8 +15,6 @@ from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.recipe import IngestSections, Recipe, TableMapping
 from tcpipe.recipe.checking import TO_MEASURE, as_toml, describe, format_values, from_values, read_annotations
 from tcpipe.robots import GENERIC, PowerSource, Profiles, Robot
-
-logger = logging.getLogger(__name__)
 
 FILE_NAME = "tcpipe.toml"
 _MOST_BYTES = 1_000_000

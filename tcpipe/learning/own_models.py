@@ -5,7 +5,6 @@ A model folder never names code; it contains arrays, and the digest of the code 
 
 import hashlib
 import inspect
-import logging
 import sys
 import traceback
 from collections.abc import Iterator
@@ -17,8 +16,6 @@ from typing import Any
 
 from tcpipe.errors import ModelError, TcpipeError, UsageError
 from tcpipe.learning.predictor import Predictor
-
-logger = logging.getLogger("tcpipe")
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -56,8 +55,6 @@ from tcpipe.planning.frames import Frame, make_frame
 from tcpipe.progress import Meter
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.target_grid import MapGrid
-
-logger = logging.getLogger("tcpipe")
 
 CARD = "cost-map.json"
 KIND = "tcpipe cost map"

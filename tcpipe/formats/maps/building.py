@@ -1,7 +1,6 @@
 """Building a map: rasters that need not share grid, resolution or CRS, put on one common grid, window by window."""
 
 import csv
-import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -46,8 +45,6 @@ from tcpipe.terrain.layers import (
 )
 from tcpipe.terrain.projection import parse_crs
 from tcpipe.terrain.target_grid import MapGrid, choose_crs, choose_grid, find_projection
-
-logger = logging.getLogger("tcpipe")
 
 Files = Path | Sequence[Path]
 """One file of a layer, or all; the last lies on top."""

@@ -1,6 +1,5 @@
 """The runs of a dataset: intact runs of one robot and recipe, and findings on excluded ones."""
 
-import logging
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,8 +26,6 @@ from tcpipe.tables.bits import Loss, flag_name
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import Finding, Findings, Remedy, Subject, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LABELLED_SEGMENTS, LABELS, Sensor
-
-logger = logging.getLogger("tcpipe")
 
 CHOICE_CODES = frozenset({"run-damaged", "run-gone", "run-ingested-otherwise"})
 """Findings on runs that are excluded though they belong in a dataset."""

@@ -1,7 +1,6 @@
 """Sampling of segments of all runs: near segments in parallel batches, pixels in a spool until they are written."""
 
 import itertools
-import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -29,8 +28,6 @@ from tcpipe.terrain.layers import Layer, join_layers, sort_layers
 from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.sampling_kernel import compute_morton
 from tcpipe.terrain.tiles import TilePool, choose_level
-
-logger = logging.getLogger("tcpipe")
 
 _BATCH_ROWS, _BATCH_BYTES = 8_192, 200_000_000
 """Segments sampled together: 50 MB of patches."""
