@@ -31,7 +31,7 @@ from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import verify_document
 from tcpipe.formats.json_files import parse_typed, read_document
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
-from tcpipe.formats.parquet import read_column_names, read_table, write_parquet_bytes
+from tcpipe.formats.parquet import read_schema, read_table, write_parquet_bytes
 from tcpipe.formats.place import REPORT, Place, find_changed_files, prove_files
 from tcpipe.formats.published_outputs import FetchedShards
 from tcpipe.formats.zarr_arrays import (
@@ -311,7 +311,7 @@ def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Ta
 def sample_columns(directory: Path) -> list[str]:
     """Return the names of the columns of a dataset's samples table; `DatasetError` if it cannot be read."""
     with _convert_errors():
-        return read_column_names(directory / SAMPLES)
+        return list(read_schema(directory / SAMPLES).names)
 
 
 @dataclass(frozen=True, slots=True)

@@ -184,10 +184,6 @@ class State:
         """Return whether the folders of a run are there; what is in them is read by `tcpipe verify`."""
         return row.blob in self.blobs and (not row.streams or row.streams_blob in self.blobs)
 
-    def find_run_id(self, sha256: str) -> str | None:
-        """Return the id of the run whose log has this sha256, or None."""
-        return min((row.run_id for row in self.runs.values() if row.log.sha256 == sha256), default=None)
-
     def find_seen(self, log: tuple[str, ...]) -> LogSnapshot | None:
         """Return the log as it was when it was seen last; None of a new one."""
         found: LogSnapshot | None = self.facts["seen"].get(make_key(find_lineage(log)))

@@ -234,11 +234,6 @@ def _read_varint(data: memoryview, at: int) -> tuple[int, int]:
     return value | byte << shift, at + 1
 
 
-def read_column_names(path: Path) -> list[str]:
-    """Return the names of the columns of a Parquet file from its footer."""
-    return list(read_schema(path).names)
-
-
 def read_schema(path: Path) -> pa.Schema:
     """Return a Parquet file's schema with its metadata, from the footer; `StoreError` names an unreadable file."""
     with _convert_damage(path):

@@ -480,8 +480,8 @@ def _make_timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> To
     keep = draft.usable & (late < LATE_NS)
     rows = np.flatnonzero(keep)
     order = rows[np.lexsort((rows, stamps[rows], draft.clock_epoch[rows]))]
-    again = _find_repeats(stamps[order], draft.clock_epoch[order])
-    same = np.zeros(len(order), bool)
+    again, same = np.zeros(len(order), bool), np.zeros(len(order), bool)
+    again[1:] = (np.diff(stamps[order]) == 0) & (np.diff(draft.clock_epoch[order]) == 0)
     repeats = np.flatnonzero(again)
     pairs = ((column[order[repeats]], column[order[repeats - 1]]) for column in times.content)
     same[repeats] = np.all([(a == b) | (np.isnan(a) & np.isnan(b)) for a, b in pairs], axis=0)
@@ -514,12 +514,6 @@ def _compute_lateness(stamp_ns: Ints, epoch: Ints, usable: Mask) -> Ints:
         if len(rows):
             late[rows] = np.maximum.accumulate(stamp_ns[rows]) - stamp_ns[rows]
     return late
-
-
-def _find_repeats(stamp_ns: Ints, epoch: Ints) -> Mask:
-    again = np.zeros(len(stamp_ns), bool)
-    again[1:] = (np.diff(stamp_ns) == 0) & (np.diff(epoch) == 0)
-    return again
 
 
 def find_simulated_clock(stamps: Mapping[str, tuple[Ints, Ints]], *, published: bool) -> SimulatedClock | None:

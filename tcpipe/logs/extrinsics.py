@@ -66,12 +66,6 @@ def build_static_tree(transforms: Sequence[Transforms]) -> Tree:
     return tree
 
 
-def _chain_poses(a_from_b: Pose, b_from_c: Pose) -> Pose:
-    return Pose(
-        a_from_b.xyz_m + rotate(a_from_b.quat_xyzw, b_from_c.xyz_m), multiply(a_from_b.quat_xyzw, b_from_c.quat_xyzw)
-    )
-
-
 def is_base(frame: str) -> bool:
     """Whether a frame is the robot's base: base_link or base_footprint, with or without a robot's prefix."""
     return frame.strip("/").rsplit("/", 1)[-1] in _BASES
@@ -90,7 +84,9 @@ def find_base_link_from(frame: str, tree: Tree) -> Pose | None:
         here = queue.popleft()
         for neighbour in sorted(tree.get(here, {})):
             if neighbour not in from_start:
-                from_start[neighbour] = _chain_poses(tree[neighbour][here], from_start[here])
+                a_from_b, b_from_c = tree[neighbour][here], from_start[here]
+                xyz_m = a_from_b.xyz_m + rotate(a_from_b.quat_xyzw, b_from_c.xyz_m)
+                from_start[neighbour] = Pose(xyz_m, multiply(a_from_b.quat_xyzw, b_from_c.quat_xyzw))
                 queue.append(neighbour)
     prefix = start.rpartition("/")[0]
     bases = [found for found in from_start if is_base(found)]

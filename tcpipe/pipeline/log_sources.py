@@ -89,11 +89,6 @@ class LogSource:
         """The size of all files."""
         return sum(size for size, _ in self.files)
 
-    @property
-    def youngest_ns(self) -> int:
-        """When a file of the log was last written [ns since 1970]."""
-        return max((time_ns for _, time_ns in self.files), default=0)
-
     def now(self) -> LogSource:
         """Return the log as it is now, since a file may have changed; object storage is not listed again."""
         if self.urls:

@@ -116,7 +116,8 @@ def make_result(source: LogSource, status: Status, made: RunFacts, sha256: str, 
 
 def check_age(task: IngestTask, now_ns: int | None = None) -> IngestResult | None:
     """Return that a log has to wait, None where it has not."""
-    age_s = ((time.time_ns() if now_ns is None else now_ns) - task.source.youngest_ns) / 1e9
+    youngest_ns = max((time_ns for _, time_ns in task.source.files), default=0)
+    age_s = ((time.time_ns() if now_ns is None else now_ns) - youngest_ns) / 1e9
     if not task.source.files or age_s >= task.min_age_s or not task.min_age_s:
         return None
     note = f"it was written {max(age_s, 0.0):.0f} s ago; it is ingested when it is {task.min_age_s:g} s old"

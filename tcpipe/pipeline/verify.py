@@ -23,7 +23,7 @@ from tcpipe.formats.documents import (
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.parquet import read_column_names, read_row_count
+from tcpipe.formats.parquet import read_row_count, read_schema
 from tcpipe.formats.place import REPORT, Place, find_wrong_files, is_desktop_file, open_place
 from tcpipe.formats.published_outputs import CARDS, FoundCard, find_newest, find_unlisted_files
 from tcpipe.formats.runs import Run, RunFacts
@@ -158,7 +158,7 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
     for name, count in {"samples": card.samples, **counts}.items():
         if count != rows:
             yield f"{where}: {name} has {count} samples, but {SAMPLES} has {rows}"
-    coordinates = [name for name in read_column_names(samples) if name in COORDINATES]
+    coordinates = [name for name in read_schema(samples).names if name in COORDINATES]
     if card.without_coordinates and coordinates:
         columns = ", ".join(coordinates)
         yield f"{where}: states that it has no coordinates, but {SAMPLES} has the columns {columns}; build it again"

@@ -62,7 +62,8 @@ def run_report(run: StoredRun, maps: StoredMaps, *, made_from: str = "") -> str:
     The page has ``made_from``, a digest of its inputs, in its head, unless some of these are damaged.
     """
     track, segments, manifest, rejections = run.track().table, run.segments(), run.manifest, run.rejections()
-    label = manifest.info.report.facts.label
+    facts = manifest.info.report.facts
+    sensors = [_make_topics_section(manifest), *_make_trust_sections(facts, rejections), *_make_clock_sections(facts)]
     ledger, total = manifest.distance_by_reason_m, manifest.driven_m
     drive, data, is_complete = _draw_run(run, track, segments, rejections=rejections, maps=maps)
     source = f"from {', '.join(manifest.log.paths)} ({manifest.log.size_bytes / 1e6:.1f} MB)"
@@ -81,8 +82,8 @@ def run_report(run: StoredRun, maps: StoredMaps, *, made_from: str = "") -> str:
         sections=[
             *drive,
             *make_losses_sections([ledger], "Kept and excluded distances add up to the odometer.", names_runs=False),
-            *_make_label_sections(run, segments, label.physics if label else None),
-            _make_sensor_section(manifest, rejections),
+            *_make_label_sections(run, segments, facts.label.physics if facts.label else None),
+            PageSection("Sensors", parts=sensors),
             _make_provenance_section(manifest),
         ],
         script="run.js" if data is not None else "",
@@ -225,13 +226,6 @@ def _make_label_sections(run: StoredRun, segments: pa.Table, physics: PhysicsFac
         *make_budget_sections(run.facts.energy_budget),
     ]
     return [PageSection("Labels", "One value per segment.", parts=parts)]
-
-
-def _make_sensor_section(manifest: Run, rejections: pa.Table) -> PageSection:
-    """Return the section on topics, rejections and clocks."""
-    facts = manifest.info.report.facts
-    parts = [_make_topics_section(manifest), *_make_trust_sections(facts, rejections), *_make_clock_sections(facts)]
-    return PageSection("Sensors", parts=parts)
 
 
 def _make_topics_section(manifest: Run) -> PageSection:

@@ -285,15 +285,15 @@ class _Stretch:
 
 
 def simulate_drive(
-    world: World, plan: Sequence[Manoeuvre], *, start_m: tuple[float, float], start_yaw_rad: float = 0.0,
+    world: World, plan: Sequence[Manoeuvre], *, start_m: tuple[float, float],
     start_ns: int = 0, robot: SimulatedRobot, weave_m: float = 0.04, rng: np.random.Generator,
 ) -> Truth:  # fmt: skip
     """Drive ``plan`` from ``start_m`` (from the site's south-west corner) and return the truth.
 
-    ``start_yaw_rad`` counts from the map's x axis; ``weave_m`` is how far the human weaves to the side.
+    The robot begins along the map's x axis; ``weave_m`` is how far the human weaves to the side.
     """
     stretches: list[_Stretch] = []
-    place, yaw = np.array(start_m, dtype=float), start_yaw_rad
+    place, yaw = np.array(start_m, dtype=float), 0.0
     for manoeuvre in plan:
         for stretch in _plan_stretches(world, manoeuvre, place, yaw, robot=robot, weave_m=weave_m, rng=rng):
             stretches.append(stretch)

@@ -154,11 +154,10 @@ _KEEP = suggest("keep", {"mask": {"require_full_speed": False}})
 
 @dataclass(frozen=True, slots=True)
 class SpeedLimit:
-    """The limit [m/s], None if unknown; the run's top command [m/s] and the share of the run at it; findings."""
+    """The limit [m/s], None if unknown; the run's top command [m/s]; findings."""
 
     limit_mps: float | None
     top_mps: float
-    held: float
     findings: Findings = ()
 
 
@@ -171,9 +170,9 @@ def find_speed_limit(rows: MotionRows, config: MaskConfig, *, max_velocity_mps: 
         window_s=config.command_window_s,
     )
     if config.max_velocity_mps is not None or max_velocity_mps is None or not config.require_full_speed:
-        return SpeedLimit(config.max_velocity_mps or max_velocity_mps, top, held)
+        return SpeedLimit(config.max_velocity_mps or max_velocity_mps, top)
     if held <= _MOST or top >= config.full_speed_fraction * max_velocity_mps:
-        return SpeedLimit(max_velocity_mps, top, held)
+        return SpeedLimit(max_velocity_mps, top)
     found = make_finding(
         "limit-from-commands",
         _COMMAND,
@@ -182,7 +181,7 @@ def find_speed_limit(rows: MotionRows, config: MaskConfig, *, max_velocity_mps: 
         limit_mps=max_velocity_mps,
         remedies=_state_limit(top),
     )
-    return SpeedLimit(top, top, held, (found,))
+    return SpeedLimit(top, top, (found,))
 
 
 def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: MaskConfig) -> Iterator[Finding]:
