@@ -529,7 +529,7 @@ def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
     for entry in entries:
         if entry.name.startswith((".", "~")) or entry.name in _FILE_SYSTEMS_OWN:
             continue
-        if _is_directory(entry):
+        if os.path.isdir(entry):  # noqa: PTH112  False where it cannot be read
             found.append((directory / entry.name, True))
         elif one_bag and entry.name.endswith(STORAGE_SUFFIXES):
             continue
@@ -546,11 +546,4 @@ def _is_other_binary(path: Path) -> bool:
     """Return whether a .bin is surely no log: other programs write such files, too; an unreadable one may be a log."""
     with suppress(LogError):
         return find_autopilot(path) is None
-    return False
-
-
-def _is_directory(entry: os.DirEntry[str]) -> bool:
-    """Return whether an entry is, or links to, a directory that may be read."""
-    with suppress(OSError):
-        return entry.is_dir()
     return False

@@ -77,7 +77,7 @@ def _find_files_by_metadata(directory: Path, present: tuple[Path, ...], informat
     if isinstance(named, list) and len(named) > MAX_FILES:
         raise LogError(f"{directory}: {METADATA} names {len(named)} files; bags of up to {MAX_FILES} are read")
     listed = [Path(name).name for name in named if isinstance(name, str)] if isinstance(named, list) else []
-    here = {name: next(filter(_is_file, (directory / name, directory / f"{name}.zstd")), None) for name in listed}
+    here = {name: next(filter(os.path.isfile, (directory / name, directory / f"{name}.zstd")), None) for name in listed}
     paths = [path for path in here.values() if path is not None]
     missing = [name for name, path in here.items() if path is None]
     taken = set(paths)
@@ -93,12 +93,6 @@ def _find_files_by_metadata(directory: Path, present: tuple[Path, ...], informat
     return Rosbag2Files(
         tuple(paths), tuple(damage), count if _is_count(count) else None, _read_topic_counts(information)
     )
-
-
-def _is_file(path: Path) -> bool:
-    with suppress(OSError):  # a name may be longer than any file's
-        return path.is_file()
-    return False
 
 
 def _is_count(value: object) -> bool:

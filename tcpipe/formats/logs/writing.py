@@ -30,6 +30,7 @@ from tcpipe.formats.logs.ros_types import load_shipped_definitions
 Encoding = Literal["ros1", "cdr"]
 
 _CHUNK_BYTES = 1 << 20
+_BYTES = {"octet": "uint8", "char": "uint8"}
 _MISSING_IN_ROSBAGS = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
 
 
@@ -122,7 +123,8 @@ def _serialize_messages(stream: MessageStream, encoding: Encoding) -> Bytes:
     count = stream.log_time_ns.size
     if not count:
         return np.empty((0, 0), np.uint8)
-    columns = {name: values for name, values in stream.columns.items() if _has_field(store, stream.type_name, name)}
+    found = {name: _find_field(store, stream.type_name, name) for name in stream.columns}
+    columns = {name: values for name, values in stream.columns.items() if found[name] is not None}
     _check_lengths(stream.topic, columns)
     first = {name: _to_rosbags_value(values[0]) for name, values in columns.items()}
     message = _make_message(store, stream.type_name, _nest_fields({**stream.constants, **first}))
@@ -132,7 +134,9 @@ def _serialize_messages(stream: MessageStream, encoding: Encoding) -> Bytes:
 
     rows = np.tile(serialize(), (count, 1))
     for name, values in columns.items():
-        dtype = values.dtype if values.dtype.kind == "S" else np.dtype(_find_leaf_dtype(store, stream.type_name, name))
+        kind, argument = found[name]
+        base = str(argument[0] if kind == Nodetype.BASE else argument[0][1][0])  # of a number, or an array's numbers
+        dtype = values.dtype if values.dtype.kind == "S" else np.dtype(_BYTES.get(base, base))
         start = _place(message, name, dtype, serialize)
         packed = np.ascontiguousarray(values.reshape(count, -1), dtype=dtype).view(np.uint8)
         rows[:, start : start + packed.shape[1]] = packed
@@ -164,25 +168,12 @@ def _place(message: Any, name: str, dtype: np.dtype[Any], serialize: Callable[[]
     return int(np.flatnonzero(written[0] != written[1])[0])
 
 
-def _find_leaf_dtype(store: Typestore, type_name: str, name: str) -> str:
-    """Return the type of a number, or of the numbers of an array."""
+def _find_field(store: Typestore, type_name: str, name: str) -> Any:
+    """Return kind and argument of a message's field; None if the dialect lacks it: ``header.seq`` is ROS 1 only."""
     *parents, leaf = name.split(".")
-    kind, argument = _list_fields(store, type_name, parents)[leaf]
-    base = str(argument[0] if kind == Nodetype.BASE else argument[0][1][0])
-    return {"octet": "uint8", "char": "uint8"}.get(base, base)
-
-
-def _list_fields(store: Typestore, type_name: str, parents: Sequence[str]) -> dict[str, Any]:
-    """Return kind and argument of each field of a message, or of the message that ``parents`` lead to in it."""
     for part in parents:
         type_name = str(dict(store.fielddefs[type_name][1])[part][1])
-    return dict(store.fielddefs[type_name][1])
-
-
-def _has_field(store: Typestore, type_name: str, name: str) -> bool:
-    """Say whether the dialect has the field: ``header.seq`` is ROS 1 only."""
-    *parents, leaf = name.split(".")
-    return leaf in _list_fields(store, type_name, parents)
+    return dict(store.fielddefs[type_name][1]).get(leaf)
 
 
 def _nest_fields(flat: Mapping[str, Any]) -> dict[str, Any]:
@@ -224,7 +215,7 @@ def _make_elements(store: Typestore, argument: Any, value: Any) -> Any:
         return [_make_message(store, inner, element) for element in (value or [])]
     if inner[0] == "string":
         return list(value or [])
-    dtype = {"octet": "uint8", "char": "uint8"}.get(inner[0], inner[0])
+    dtype = _BYTES.get(inner[0], inner[0])
     return np.zeros(length, dtype) if value is None else np.asarray(value, dtype)
 
 
