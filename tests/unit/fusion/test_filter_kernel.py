@@ -256,7 +256,7 @@ class Problem:
     def solve(self):
         """Return the states, the Jacobians, and the covariance of what is free."""
         free = np.zeros(self.free)
-        for _ in range(6):
+        for _ in range(4):
             states, maps = self.play(free)
             lines, residuals = [np.eye(free.size)], [free]
             for k, kind in self.rows:

@@ -390,15 +390,14 @@ def colours_at(x, y):
 
 ORTHOS = {
     "north up": NORTH_UP,
-    "rotated": Affine(0.008, 0.006, LEFT + 2.0, 0.006, -0.008, TOP - 14.0),
+    "rotated": Affine(0.016, 0.012, LEFT + 2.0, 0.012, -0.016, TOP - 14.0),
 }
 
 
-@pytest.mark.parametrize("files", [1, 2])
-@pytest.mark.parametrize("name", ORTHOS)
+@pytest.mark.parametrize(("name", "files"), [("north up", 1), ("north up", 2), ("rotated", 2)])
 def test_an_orthophoto_has_a_small_picture_in_colour(tmp_path, height, name, files):
     affine = ORTHOS[name]
-    size = 400 if name == "north up" else 2000
+    size = 400 if name == "north up" else 1000
     bands = np.concatenate([raster_of(lambda x, y, n=n: colours_at(x, y)[n], affine, size, size) for n in range(3)])
     split = np.array_split(np.arange(size), files)
     ortho = [
