@@ -1,10 +1,10 @@
 """A drive over a known bumpy surface, and what its sensors would measure: truth for tests of the forward filter."""
 
-import math
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from unit.fusion.drive import make_drive, ns
 
 from tcpipe.fusion.measurements import (
     DISPLACEMENT_LAGS_S,
@@ -15,10 +15,9 @@ from tcpipe.fusion.measurements import (
     Positions,
     Trajectory,
 )
-from tcpipe.geometry.rotation import quat_from_matrix, quat_from_rpy, rotation_vector_from_quat, rpy_from_matrix
+from tcpipe.geometry.rotation import quat_from_matrix, quat_from_rpy, rpy_from_matrix
 from tcpipe.tables.facts import StretchFacts
 
-GRAVITY_MPS2 = 9.80665
 RATE_HZ = 200
 ANTENNA_M = (0.2, -0.1, 0.8)
 CAMERA_M = (0.4, 0.06, 0.3)
@@ -41,63 +40,19 @@ class Drive:
         return (np.asarray(stamp_ns) - self.stamp_ns[0]) // (1_000_000_000 // RATE_HZ)
 
 
-def _surface(x, y):
-    """Height, and its slopes east and north: hills to some 15 degrees and bumps of a robot's length."""
-    z = 2.0 * np.sin(x / 9.0) * np.cos(y / 11.0) + 0.02 * np.sin(x / 0.5) * np.sin(y / 0.6)
-    dx = 2.0 / 9.0 * np.cos(x / 9.0) * np.cos(y / 11.0) + 0.04 * np.cos(x / 0.5) * np.sin(y / 0.6)
-    dy = -2.0 / 11.0 * np.sin(x / 9.0) * np.sin(y / 11.0) + 0.02 / 0.6 * np.sin(x / 0.5) * np.cos(y / 0.6)
-    return z, dx, dy
-
-
-def _frame(heading, dx, dy):
-    up = np.stack((-dx, -dy, np.ones_like(dx)), -1)
-    up /= np.linalg.norm(up, axis=-1, keepdims=True)
-    ahead = np.stack((np.cos(heading), np.sin(heading), dx * np.cos(heading) + dy * np.sin(heading)), -1)
-    ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
-    return np.stack((ahead, np.cross(up, ahead), up), -1)
-
-
 @cache
 def drive(seconds=120.0, seed=0):
-    """Speeds up, weaves at about 1 m/s, slows down twice a minute."""
-    rng = np.random.default_rng(seed)
-    phase = rng.uniform(0, 2 * np.pi, 4)
-    n = int(seconds * RATE_HZ) + 1
-    t = np.arange(2 * n - 1) / (2 * RATE_HZ)  # half steps, for the midpoint rule
-    speed = np.clip(t / 3.0, 0.0, 1.0) * (0.8 + 0.3 * np.sin(2 * np.pi * t / 30.0 + phase[0]))
-    heading = (
-        phase[3]
-        + 0.9 * np.sin(2 * np.pi * t / 25.0 + phase[1])
-        + 0.25 * np.sin(2 * np.pi * t / 4.0 + phase[2])
-        + 0.02 * t
-    )
-    heading -= heading[0] - phase[3]
-    xy = np.zeros((n, 2))
-    ahead = np.column_stack((np.cos(heading), np.sin(heading))).tolist()
-    x = y = 0.0
-    for k in range(n - 1):
-        at_x, at_y = x, y
-        for half, share in ((2 * k, 0.5), (2 * k + 1, 1.0)):
-            _, dx, dy = _surface(at_x, at_y)
-            east, north = ahead[half]
-            step = speed[half] * share / RATE_HZ / math.hypot(1.0, dx * east + dy * north)
-            at_x, at_y = x + step * east, y + step * north
-        x, y = xy[k + 1] = at_x, at_y
-    z, dx, dy = _surface(xy[:, 0], xy[:, 1])
-    rotation = _frame(heading[::2], dx, dy)
-    velocity = speed[::2, None] * rotation[:, :, 0]
-    acceleration = np.gradient(velocity, 1 / RATE_HZ, axis=0)
-    between = np.einsum("kji,kjl->kil", rotation[:-1], rotation[1:])
-    steps = rotation_vector_from_quat(quat_from_matrix(between)) * RATE_HZ
-    turn = np.concatenate((steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]))
+    """Drive over the hills of `unit.fusion.drive`, at about 1 m/s with a halt a minute; ``seed`` chooses the first yaw."""
+    made = make_drive(seconds + 0.003, start_yaw=float(seed), stand_s=0.9)
+    rows = slice(None, None, 2)
     return Drive(
-        stamp_ns=1_700_000_000_000_000_000 + np.arange(n, dtype=np.int64) * (1_000_000_000 // RATE_HZ),
-        position=np.column_stack((xy, z)),
-        rotation=rotation,
-        velocity=velocity,
-        body_velocity=np.einsum("kji,kj->ki", rotation, velocity),
-        turn=turn,
-        force=np.einsum("kji,kj->ki", rotation, acceleration + np.array([0, 0, GRAVITY_MPS2])),
+        stamp_ns=ns(made.t[rows]),
+        position=made.position[rows],
+        rotation=made.rotation[rows],
+        velocity=made.velocity[rows],
+        body_velocity=np.einsum("kji,kj->ki", made.rotation[rows], made.velocity[rows]),
+        turn=made.rate[rows],
+        force=made.force[rows],
     )
 
 

@@ -54,7 +54,7 @@ def test_all_sensors_reach_centimetres_and_know_it(truth):
     trajectory = _run(truth, measured(truth, 1))
     errors, scaled = _errors(truth, trajectory)
     assert _rms(np.hypot(errors[:, 0], errors[:, 1])) < 0.03
-    assert (_rms(errors)[2:] < [0.03, 0.02, np.radians(0.8)]).all()
+    assert (_rms(errors)[2:] < [0.04, 0.02, np.radians(0.8)]).all()
     assert (_rms(scaled) < 1.5).all()  # few errors of one drive are independent
     assert (_rms(scaled) > 0.25).all()
     assert set(trajectory.facts.measurements) == {GNSS, WHEELS, VISUAL}
@@ -62,7 +62,7 @@ def test_all_sensors_reach_centimetres_and_know_it(truth):
 
 
 @pytest.mark.parametrize(
-    ("absent", "within_m"), [(("wheels", "visual"), 0.06), (("imu", "wheels", "visual"), 0.12), (("gnss",), 5.0)]
+    ("absent", "within_m"), [(("wheels", "visual"), 0.06), (("imu", "wheels", "visual"), 0.2), (("gnss",), 5.0)]
 )
 def test_goes_on_without_a_sensor(truth, absent, within_m):
     trajectory = _run(truth, replace(measured(truth, 2), **dict.fromkeys(absent)))
