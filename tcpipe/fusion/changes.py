@@ -134,17 +134,6 @@ class Change:
                         else Event(self.last, place, std, -mean)
                     )
 
-    def alter_ticks(self, ticks: Ticks) -> Ticks:
-        """Return the ticks as they are under the change."""
-        if self.kind != "noise":
-            return ticks
-        # Reflected signals change as the antenna moves by a metre.
-        kept = np.full_like(ticks.inputs.fix_kept, np.exp(-ticks.inputs.period_s / 1.5))
-        variance = np.maximum(ticks.fix_variance_m2, np.square(self.size * FIX_AXES))
-        noise = compute_process_noise(kept, variance)
-        inputs = ticks.inputs._replace(fix_kept=kept, fix_noise=noise)
-        return replace(ticks, inputs=inputs, fix_variance_m2=variance)
-
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
@@ -160,8 +149,12 @@ class Hypothesis:
 
     def alter_ticks(self, ticks: Ticks) -> Ticks:
         """Return the ticks as they are under all changes."""
-        for change in self.changes:
-            ticks = change.alter_ticks(ticks)
+        for change in (each for each in self.changes if each.kind == "noise"):
+            # Reflected signals change as the antenna moves by a metre.
+            kept = np.full_like(ticks.inputs.fix_kept, np.exp(-ticks.inputs.period_s / 1.5))
+            variance = np.maximum(ticks.fix_variance_m2, np.square(change.size * FIX_AXES))
+            inputs = ticks.inputs._replace(fix_kept=kept, fix_noise=compute_process_noise(kept, variance))
+            ticks = replace(ticks, inputs=inputs, fix_variance_m2=variance)
         return ticks
 
     def alter_priors(self, std: Floats, walk: Floats, time_s: Floats) -> None:

@@ -153,7 +153,8 @@ CHANGES = {
 
 
 def _find_span_s(each: StretchFacts | GateReset | ChangeFacts, first_ns: int) -> tuple[float, float]:
-    return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
+    """Return begin and end since the first stamp [s]; the first tick is before it."""
+    return max(each.start_ns - first_ns, 0) / 1e9, (each.end_ns - first_ns) / 1e9
 
 
 def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams: Streams) -> Iterator[Finding]:
