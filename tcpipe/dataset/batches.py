@@ -9,14 +9,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats32, GenericArray, Ints, Mask
 from tcpipe.dataset.tensor import TensorLayout
 from tcpipe.formats.dataset_files import PatchFiles
+from tcpipe.terrain.layers import LayerPixels
 
 Batch = tuple[Floats32 | tuple[Floats32, Floats32], ...]
-Pixels = dict[str, NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]]
+Pixels = dict[str, LayerPixels]
 
 IN_MEMORY_BYTES = 2 << 30
 """A split whose stored layers are smaller is kept in memory; the paper's whole dataset takes 70 MB."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tcpipe.arrays import Bytes, Floats32, Ints, Mask
 from tcpipe.compiled import compile_kernel
 from tcpipe.errors import DatasetError
-from tcpipe.terrain.layers import Layer, sort_layers
+from tcpipe.terrain.layers import LayerPixels, Layers, sort_layers
 
 
 @compile_kernel
@@ -51,7 +51,7 @@ def form_numbers(  # noqa: PLR0917
                 line[c, channel] = value if stored[c] == stored[c] and stored[c] != nodata else none
 
 
-Pixels = Mapping[str, NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]]
+Pixels = Mapping[str, LayerPixels]
 
 ONE_HOT = "_one_hot"
 """Ending of a categorical layer's name: a channel for each of its classes, 1 where the pixel is of it."""
@@ -69,7 +69,7 @@ class TensorLayout:
     """
 
     channels: tuple[str, ...]
-    known: Mapping[str, Layer]
+    known: Layers
     patch_px: int
 
     @cached_property
@@ -126,7 +126,7 @@ class TensorLayout:
         return out
 
 
-def make_tensor_layout(channels: Sequence[str], known: Mapping[str, Layer], patch_px: int) -> TensorLayout:
+def make_tensor_layout(channels: Sequence[str], known: Layers, patch_px: int) -> TensorLayout:
     """Return the layout with these channels; `DatasetError` names those that the stored layers cannot give."""
     possible = [*known, *(f"{name}{ONE_HOT}" for name, layer in known.items() if layer.kind == "categorical")]
     unknown = [channel for channel in channels if channel not in possible]

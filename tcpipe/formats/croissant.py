@@ -7,7 +7,7 @@ import pyarrow as pa
 
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import SAMPLES, SHARDS
-from tcpipe.formats.integrity import Checksum
+from tcpipe.formats.integrity import Checksum, FileChecksums
 from tcpipe.formats.json_files import Json, to_json
 from tcpipe.formats.maps.map_facts import read_layers
 
@@ -41,7 +41,7 @@ _ENCODING_BY_SUFFIX = {
 }
 
 
-def format_croissant(card: DatasetCard, samples: pa.Schema, files: Mapping[str, Checksum]) -> str:
+def format_croissant(card: DatasetCard, samples: pa.Schema, files: FileChecksums) -> str:
     """Return the document as JSON-LD; the metadata of ``samples``, the schema of the samples, gives their meanings."""
     source = {"fileObject": {"@id": SAMPLES}}
     records = [_describe_records("samples", "One record a sample, in the order of the patches.", samples, source)]

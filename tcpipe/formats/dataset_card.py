@@ -6,7 +6,7 @@ from typing import Literal
 
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
-from tcpipe.formats.integrity import Checksum
+from tcpipe.formats.integrity import Checksum, FileChecksums
 from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.formats.maps.map_facts import Description, MapInputs
 from tcpipe.recipe import Recipe
@@ -14,6 +14,7 @@ from tcpipe.tables.facts import EnergyBudget, Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import Finding, Findings, Verdict, judge_by_code, omit
 from tcpipe.tables.levels import LABELS
 from tcpipe.terrain.layers import TerrainClass
+from tcpipe.terrain.projection import Box
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +256,7 @@ class MapSource:
     registration: tuple[MapRegistration, ...] = ()
 
     @property
-    def bounds_m(self) -> tuple[float, float, float, float]:
+    def bounds_m(self) -> Box:
         """Least x and y, greatest x and y in its plane [m]."""
         width_m, height_m = self.cols * self.pixel_size_m, self.rows * self.pixel_size_m
         return self.x_min_m, self.y_max_m - height_m, self.x_min_m + width_m, self.y_max_m
@@ -327,7 +328,7 @@ class DatasetCard:
     without_coordinates: bool = omit(False)
     """Whether places are metres from an unpublished origin; then names, times, maps and regions are omitted too."""
     shards: tuple[Shard, ...]
-    checksums: Mapping[str, Checksum]
+    checksums: FileChecksums
     """By path inside the dataset."""
 
     @property

@@ -45,12 +45,9 @@ from tcpipe.formats.zarr_arrays import (
 )
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.levels import DATA_MODEL_VERSION, describe_other_data_model
-from tcpipe.terrain.layers import Layer, find_no_data_value, sort_layers
+from tcpipe.terrain.layers import Layer, LayerPixels, Layers, find_no_data_value, sort_layers
 
 FileFormat = Literal["zarr", "parquet"]
-LayerPixels = NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]
-"""Patches of one layer as they are stored, shape (N, px, px)."""
-
 CARD = "dataset.json"
 CROISSANT = "croissant.json"
 SAMPLES = "samples.parquet"
@@ -96,7 +93,7 @@ _AGAIN = "; build the dataset again"
 class Pixels:
     """Patches to write: row i of the dataset is what ``read(layer, slots[i : i + 1])`` returns, shape (1, px, px)."""
 
-    layers: Mapping[str, Layer]
+    layers: Layers
     patch_px: int
     slots: Ints
     read: Callable[[str, Ints], LayerPixels]
@@ -323,7 +320,7 @@ class PatchFiles:
     """
 
     directory: Path
-    layers: Mapping[str, Layer]
+    layers: Layers
     patch_px: int
     starts: Ints
     arrays: Mapping[str, ShardedArray] = field(default_factory=dict)
@@ -417,7 +414,7 @@ def open_patches(directory: Path, card: DatasetCard, fetched: FetchedShards | No
     return PatchFiles(directory, layers, px, starts, arrays, fetched=fetched)
 
 
-def _open_sharded_patches(directory: Path, layers: Mapping[str, Layer], px: int, card: DatasetCard) -> PatchFiles:
+def _open_sharded_patches(directory: Path, layers: Layers, px: int, card: DatasetCard) -> PatchFiles:
     rows = [shard.rows for shard in card.shards]
     if min(rows, default=0) < 0 or sum(rows) != card.samples:
         raise DatasetError(f"{directory / CARD}: its shards hold {sum(rows)} rows, expected {card.samples}")

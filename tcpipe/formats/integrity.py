@@ -40,11 +40,14 @@ class Checksum:
     sha256: str
 
 
+FileChecksums = Mapping[str, Checksum]
+
+
 @dataclass(frozen=True, slots=True)
 class Checksums:
     """The document ``checksums.json``: every file of its directory, by path."""
 
-    checksums: Mapping[str, Checksum]
+    checksums: FileChecksums
 
 
 def compute_short_digest(data: bytes) -> str:
@@ -94,7 +97,7 @@ def write_checksums(directory: Path) -> None:
     write_sealed(directory / CHECKSUMS, Checksums(compute_checksums(directory)))
 
 
-def read_checksums(directory: Path) -> Mapping[str, Checksum]:
+def read_checksums(directory: Path) -> FileChecksums:
     """Return what ``checksums.json`` has of every file of its directory; `StoreError` as `read_sealed`."""
     return read_sealed_as(directory / CHECKSUMS, Checksums).checksums
 

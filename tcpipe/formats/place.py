@@ -21,7 +21,7 @@ from tcpipe.errors import MissingFileError, StoreError
 from tcpipe.formats import atomic
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.cache import fetch_cached
-from tcpipe.formats.integrity import ALL_CHANGES, Checksum, compute_checksum, find_wrong_checksum
+from tcpipe.formats.integrity import ALL_CHANGES, Checksum, FileChecksums, compute_checksum, find_wrong_checksum
 from tcpipe.formats.object_storage import (
     ask_store,
     is_url,
@@ -280,7 +280,7 @@ def find_wrong_files(place: Place, checksums: Mapping[str, Checksum | None]) -> 
             yield line
 
 
-def prove_files(directory: Path, checksums: Mapping[str, Checksum], names: Iterable[str]) -> None:
+def prove_files(directory: Path, checksums: FileChecksums, names: Iterable[str]) -> None:
     """Compare files of a directory with their checksums; `StoreError` names the first that differs."""
     lines = list(find_wrong_files(Place(directory), {name: checksums.get(name) for name in names}))
     if lines:
@@ -288,7 +288,7 @@ def prove_files(directory: Path, checksums: Mapping[str, Checksum], names: Itera
         raise StoreError(f"{lines[0]}{more}{ALL_CHANGES.format(directory)}")
 
 
-def find_changed_files(place: Place, checksums: Mapping[str, Checksum], names: Iterable[str]) -> list[str]:
+def find_changed_files(place: Place, checksums: FileChecksums, names: Iterable[str]) -> list[str]:
     """Return a line for each named file that differs from its checksum; all sizes are compared before a file is read.
 
     The cache keeps the digest of a file under its `Place.version`: a file is hashed again only after it has changed.

@@ -12,7 +12,7 @@ there, are read as they are.
 
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -31,7 +31,7 @@ from tcpipe.formats.atomic import (
     write_atomic_directory,
 )
 from tcpipe.formats.cache import fetch_cached, is_cached
-from tcpipe.formats.integrity import Checksum, Checksums, compute_short_digest
+from tcpipe.formats.integrity import Checksum, Checksums, FileChecksums, compute_short_digest
 from tcpipe.formats.json_files import parse_json, parse_typed, parse_typed_json, to_json
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.place import REPORT, FileEntry, Place, find_changed_files, open_place
@@ -80,7 +80,7 @@ def require_card(url: str, cards: Sequence[str] = CARDS) -> FoundCard:
     return found
 
 
-def read_listed_files(card: FoundCard) -> Mapping[str, Checksum]:
+def read_listed_files(card: FoundCard) -> FileChecksums:
     """Return the files that a card lists; `StoreError` if one of them is not beside it."""
     where = card.place.where(card.name)
     checksums = parse_typed(parse_json(card.data, Path(where)), Checksums, Path(where)).checksums
@@ -201,7 +201,7 @@ class FetchedShards:
 
     place: Place
     root: Path
-    checksums: Mapping[str, Checksum]
+    checksums: FileChecksums
     proves: bool = False
     """Whether the checksum of a shard is computed before a piece of it is read: once, until its ETag changes."""
     _proved: set[str] = field(default_factory=set)
@@ -284,7 +284,7 @@ def fetch_directory_by_range(path: Location, *, by_range: Callable[[str], bool])
 
 
 def fetch_files(
-    place: Place, checksums: Mapping[str, Checksum], *, by_range: Callable[[str], bool]
+    place: Place, checksums: FileChecksums, *, by_range: Callable[[str], bool]
 ) -> tuple[Path, FetchedShards | None]:
     """Return a local directory with a place's files except those ``by_range``, and where these are read.
 
@@ -297,9 +297,7 @@ def fetch_files(
     return root, _fetch_others(place, root, checksums, by_range)
 
 
-def _fetch_others(
-    place: Place, root: Path, checksums: Mapping[str, Checksum], by_range: Callable[[str], bool]
-) -> FetchedShards:
+def _fetch_others(place: Place, root: Path, checksums: FileChecksums, by_range: Callable[[str], bool]) -> FetchedShards:
     """Copy the files of a place that are not ``by_range`` to ``root``; return where the others are read."""
 
     def fetch(name: str) -> None:

@@ -8,7 +8,7 @@ from html import escape
 from typing import Literal, TypeAlias
 
 from tcpipe.errors import clean_line
-from tcpipe.formats.integrity import Checksum
+from tcpipe.formats.integrity import FileChecksums
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFit, StageFacts
@@ -99,7 +99,7 @@ class StoredMap:
     name: str
     data_model_version: str
     blob: str
-    files: Mapping[str, Checksum]
+    files: FileChecksums
 
     @property
     def zarr(self) -> str:
@@ -274,11 +274,11 @@ class RunFacts:
     """Terms of the power fit with standard deviations, in SI, by ``term`` or, for one class, ``term on terrain``."""
     blob: str
     """Folder of its tables; "" of a run whose tables were pruned."""
-    tables: Mapping[str, Checksum]
+    tables: FileChecksums
     """``track.parquet``, ``segments.parquet`` and ``rejections.parquet`` in that folder."""
     streams_blob: str
     """Folder of its streams: its own, or that of a run of the same log with the same streams."""
-    streams: Mapping[str, Checksum]
+    streams: FileChecksums
     """``streams/<role>.parquet`` in that folder."""
     tags: Mapping[str, str] = omit({})
     """Tags of its log, read from the records of tags; not written to the manifest."""

@@ -12,7 +12,7 @@ import numpy as np
 from tcpipe.arrays import Floats
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.dataset.tensor import TensorLayout, make_tensor_layout
-from tcpipe.formats.integrity import Checksum
+from tcpipe.formats.integrity import FileChecksums
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.maps.map_facts import Description, read_layers
 from tcpipe.learning.fitting import FitConfig, ModelKind
@@ -121,7 +121,7 @@ class ModelCard:
     """Physics of the robot, by the dataset: the planner takes the cost of turns from it."""
     dataset: TrainedOn
     training: Training
-    checksums: Mapping[str, Checksum] = field(default_factory=dict)
+    checksums: FileChecksums = field(default_factory=dict)
     """Checksums of the files next to it, by name."""
 
     @cached_property

@@ -20,7 +20,7 @@ from tcpipe.formats.documents import (
     parse_name,
     read_record,
 )
-from tcpipe.formats.integrity import CHECKSUMS, Checksum, Checksums, find_broken_seal, read_checksums
+from tcpipe.formats.integrity import CHECKSUMS, Checksums, FileChecksums, find_broken_seal, read_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_row_count, read_schema
@@ -164,7 +164,7 @@ def _verify_counts(samples: Path, card: DatasetCard, where: str) -> Iterator[Che
         yield f"{where}: states that it has no coordinates, but {SAMPLES} has the columns {columns}; build it again"
 
 
-def _verify_files(place: Place, checksums: Mapping[str, Checksum], repair: str) -> Generator[CheckResult, None, bool]:
+def _verify_files(place: Place, checksums: FileChecksums, repair: str) -> Generator[CheckResult, None, bool]:
     """Read files again, compare them with their document, and return whether all are unchanged."""
     wrong = list(find_wrong_files(place, checksums))
     yield from wrong

@@ -28,7 +28,7 @@ from tcpipe.arrays import Bytes, Floats, Floats32
 from tcpipe.cost.prediction_errors import QuantityErrors
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import Location, clear_beside, lock_directory, make_scratch_directory, write_text
-from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as, write_sealed
+from tcpipe.formats.integrity import FileChecksums, compute_checksums, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
@@ -116,7 +116,7 @@ class CostMapCard:
     barred_by: tuple[str, ...] = tuple(flag_name(reason) for reason in Reason if reason & BARRED)
     aggregation: str = AGGREGATION
     """Aggregation of the courses of a cell in its bands and in the Nav2 maps."""
-    checksums: Mapping[str, Checksum]
+    checksums: FileChecksums
     origin_deg: tuple[float, float] | None = None
     """Longitude and latitude of the origin of the Nav2 maps; None: they are in the plane of the CRS."""
     label_energy: str = "total"

@@ -18,7 +18,6 @@ from tcpipe.formats.runs import StoredMap
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.report.colours import CLASS_COLOURS, CURSOR, FAINT, SPLIT_COLOURS, choose_class_colours
 from tcpipe.report.pictures import (
-    Bounds,
     compute_joint_bounds_m,
     draw_classes,
     draw_ortho,
@@ -30,6 +29,7 @@ from tcpipe.report.plots import Plot, lay_picture, make_map_plot, make_plot
 from tcpipe.store import Store
 from tcpipe.tables.columns import read_ends_m, read_lonlat_deg, stack_floats
 from tcpipe.terrain.layers import TerrainClass
+from tcpipe.terrain.projection import Box
 
 Pictures = Mapping[str, str]
 """Pictures of a map by name, as data URIs; the first is visible."""
@@ -135,7 +135,7 @@ def _draw_histogram() -> Plot:
     return plot
 
 
-def _lay_dataset_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds: Bounds) -> list[str]:
+def _lay_dataset_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds: Box) -> list[str]:
     has_ortho = any("ortho" in grid.layers for grid in card.maps)
     files = {"orthophoto" if has_ortho else "hillshade": OVERVIEW, "hillshade ": RELIEF, "classes": CLASSES}
     lost = []

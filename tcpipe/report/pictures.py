@@ -21,6 +21,7 @@ from tcpipe.formats.maps.map_files import PICTURE_PX, MapFile
 from tcpipe.report.colours import choose_class_colours
 from tcpipe.tables.columns import to_floats
 from tcpipe.terrain.layers import COLOURS, MAX_ID, ClassTable, Layer, Pixels
+from tcpipe.terrain.projection import Box
 
 ACROSS = 25
 """Patches in one row of a sheet."""
@@ -79,11 +80,7 @@ def colour_heights(values: Floats) -> Bytes:
     return np.where(known[..., None], colours, 255.0).astype(np.uint8)
 
 
-Bounds = tuple[float, float, float, float]
-"""x_min, y_min, x_max, y_max [m]."""
-
-
-def compute_joint_bounds_m(places: Sequence[tuple[str, Bounds]]) -> Bounds:
+def compute_joint_bounds_m(places: Sequence[tuple[str, Box]]) -> Box:
     """Return the bounds of all maps, each given with its CRS, in the CRS of the first."""
     first = places[0][0]
     projected = [

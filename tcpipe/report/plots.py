@@ -26,6 +26,7 @@ from bokeh.plotting import figure
 from tcpipe.errors import clean_line
 from tcpipe.formats.json_files import Json
 from tcpipe.report.colours import CURSOR, DROPPED, KEPT, SPLIT_COLOURS
+from tcpipe.terrain.projection import Box
 
 BOKEH_SCRIPT = Path(bokeh.__file__).parent / "server/static/js/bokeh.min.js"
 """The part of BokehJS that a page needs."""
@@ -110,7 +111,7 @@ def make_map_plot(
     return plot
 
 
-def lay_picture(plot: Plot, name: str, uri: str, bounds_m: tuple[float, float, float, float], *, visible: bool) -> None:
+def lay_picture(plot: Plot, name: str, uri: str, bounds_m: Box, *, visible: bool) -> None:
     """Lay a picture over ``bounds_m`` (least x and y, greatest x and y) under all else, as ``layer <name>``."""
     x_min_m, y_min_m, x_max_m, y_max_m = bounds_m
     renderer = plot.figure.image_url(

@@ -16,6 +16,7 @@ from scipy.special import erf
 
 from tcpipe.arrays import Bytes, Floats, Mask
 from tcpipe.tables.findings import omit
+from tcpipe.terrain.projection import Box
 
 _SEMI_MAJOR_M = 6378137.0
 _ECCENTRICITY2 = 0.0066943799901413165
@@ -247,7 +248,7 @@ class Ellipse:
         b = (c * (v - self.y_m) - s * (u - self.x_m)) / self.y_radius_m
         return np.asarray((1.0 - np.hypot(a, b)) * min(self.x_radius_m, self.y_radius_m))
 
-    def may_touch(self, box: tuple[float, float, float, float]) -> bool:
+    def may_touch(self, box: Box) -> bool:
         """Compare the circumscribed circle with the box."""
         reach = max(self.x_radius_m, self.y_radius_m) * (1.0 + 1.0 / min(self.x_radius_m, self.y_radius_m))
         return box[0] - reach < self.x_m < box[2] + reach and box[1] - reach < self.y_m < box[3] + reach
@@ -275,7 +276,7 @@ class Band:
         offset = across - self.amplitude_m * np.sin(angle)
         return np.asarray(self.width_m / 2.0 - np.abs(offset) / np.hypot(1.0, self.amplitude_m * k * np.cos(angle)))
 
-    def may_touch(self, box: tuple[float, float, float, float]) -> bool:
+    def may_touch(self, box: Box) -> bool:
         """Compare the straight strip that holds the band with the box."""
         c, s = np.cos(self.direction_rad), np.sin(self.direction_rad)
         u, v = (box[0] + box[2]) / 2 - self.x_m, (box[1] + box[3]) / 2 - self.y_m

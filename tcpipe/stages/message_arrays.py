@@ -16,7 +16,7 @@ from tcpipe.logs.extrinsics import Transforms
 from tcpipe.logs.messages import LOG_TIME
 from tcpipe.logs.topics import Topic
 from tcpipe.power.rails import Rail, make_rail, make_samples
-from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_numbers, to_texts
+from tcpipe.tables.columns import Tables, select_rows, to_floats, to_integers, to_numbers, to_texts
 from tcpipe.tables.levels import STREAMS, Streams
 
 T = TypeVar("T", bound=np.generic)
@@ -36,7 +36,7 @@ class LogReader(Protocol):
         A topic that cannot be decoded is missing from the result.
         """
 
-    def batches(self, topics: Sequence[str]) -> Iterator[Mapping[str, pa.Table]]:
+    def batches(self, topics: Sequence[str]) -> Iterator[Tables]:
         """Yield these tables piecewise: the next rows of some topics; a message far behind its time comes later."""
 
 
@@ -144,7 +144,7 @@ _PUBLISH_TIME = "publish_time_ns"
 
 
 def gather_messages(
-    batches: Iterable[Mapping[str, pa.Table]], played: Mapping[str, Collection[str]]
+    batches: Iterable[Tables], played: Mapping[str, Collection[str]]
 ) -> tuple[dict[str, Arrays], dict[str, pa.Table]]:
     """Return the messages of a log by topic, in order of log time: ``played`` topics as arrays, others as tables.
 

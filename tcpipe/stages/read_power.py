@@ -19,7 +19,7 @@ from tcpipe.power.witnesses import compute_side_share
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Profiles
-from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_texts
+from tcpipe.tables.columns import Tables, select_rows, to_floats, to_integers, to_texts
 from tcpipe.tables.findings import Finding, Findings, Severity, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import STREAMS
 
@@ -76,7 +76,7 @@ _STRAIGHT_RADPS, _MOVING_MPS, _STILL_MPS = 0.05, 0.2, 0.01
 """Largest turn rate and smallest speed of straight driving, largest speed at rest."""
 
 
-def add_side_share(power: PowerReadings, streams: Mapping[str, pa.Table]) -> PowerReadings:
+def add_side_share(power: PowerReadings, streams: Tables) -> PowerReadings:
     """Return power with one side's share of the current in straight driving above that at rest (needs an odometry)."""
     motion = _choose_odometry(streams)
     if power.facts is None or power.sides is None or motion is None:
@@ -96,7 +96,7 @@ def add_side_share(power: PowerReadings, streams: Mapping[str, pa.Table]) -> Pow
     return replace(power, facts=replace(power.facts, side_share=share))
 
 
-def _choose_odometry(streams: Mapping[str, pa.Table]) -> pa.Table | None:
+def _choose_odometry(streams: Tables) -> pa.Table | None:
     return next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
 
 
@@ -146,9 +146,7 @@ def read_rail_power(rail: RailReadings, times: Columns, columns: Columns) -> tup
     return voltage, current
 
 
-def add_averaging(
-    power: PowerReadings, streams: Mapping[str, pa.Table], config: ReadConfig
-) -> tuple[PowerReadings, Findings]:
+def add_averaging(power: PowerReadings, streams: Tables, config: ReadConfig) -> tuple[PowerReadings, Findings]:
     """Return the power with whether its values are means over their period, and the finding where that is assumed."""
     counts = any(rail.counter is not None for rails in power.rails.values() for rail in rails)
     if power.facts is not None and config.power_averaged != "auto" and not counts:

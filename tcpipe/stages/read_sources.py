@@ -33,7 +33,7 @@ from tcpipe.recipe.suggestions import make_place_to_measure, suggest
 from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import Arrays, LogReader, read_transforms
 from tcpipe.stages.read_power import list_second_meters, read_power_of_topics, select_power_rows
-from tcpipe.tables.columns import to_floats
+from tcpipe.tables.columns import Tables, to_floats
 from tcpipe.tables.findings import Finding, Findings, Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor
 
@@ -195,7 +195,7 @@ _WITHOUT_PLACE = ("power", "command", "gnss_velocity")
 
 def place_sensors(
     log: LogReader,
-    tables: Mapping[str, pa.Table],
+    tables: Tables,
     assignment: RoleAssignment,
     sources: Sequence[TopicReadings],
     timelines: Mapping[str, TopicTimeline],
@@ -232,7 +232,7 @@ def place_sensors(
 
 def place_frames(
     log: LogReader,
-    tables: Mapping[str, pa.Table],
+    tables: Tables,
     assignment: RoleAssignment,
     frame_of: Mapping[Role, str],
     config: ReadConfig,
@@ -250,9 +250,7 @@ def place_frames(
     return {role: _place(role, frame, tree, config) for role, frame in frame_of.items()}
 
 
-def _build_tree(
-    log: LogReader, tables: Mapping[str, pa.Table], assignment: RoleAssignment, open_frames: set[str]
-) -> Tree:
+def _build_tree(log: LogReader, tables: Tables, assignment: RoleAssignment, open_frames: set[str]) -> Tree:
     static = [read_transforms(tables[topic]) for topic in assignment.transforms if topic in tables]
     tree = build_static_tree(static)
     moving = [topic for topic in assignment.transforms if topic not in tables]
@@ -280,7 +278,7 @@ _POSE_ROLE = Subject("role", _POSE)
 
 
 def place_pose(
-    streams: Mapping[str, pa.Table], assignment: RoleAssignment, config: ReadConfig
+    streams: Tables, assignment: RoleAssignment, config: ReadConfig
 ) -> tuple[dict[str, pa.Table], str, Findings]:
     """Return the streams with the pose in longitude and latitude, the CRS of these, and findings.
 

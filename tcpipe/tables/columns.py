@@ -6,9 +6,10 @@ Arrow field metadata contain units, frames, flag bits and one-line meanings, so 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntFlag
+from typing import TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +19,9 @@ from numpy.typing import NDArray
 from tcpipe.arrays import AnyArray, Floats, Ints, Texts
 from tcpipe.errors import TableError
 from tcpipe.tables.bits import flag_name
+
+Tables: TypeAlias = Mapping[str, pa.Table]
+"""By role or topic."""
 
 
 def to_numbers(column: pa.Array | pa.ChunkedArray) -> AnyArray:

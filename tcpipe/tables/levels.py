@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from tcpipe.errors import TableError
 from tcpipe.tables.bits import DropReason, Quality
-from tcpipe.tables.columns import Column, TableSchema
+from tcpipe.tables.columns import Column, Tables, TableSchema
 from tcpipe.tables.facts import NOTHING_FOUND, StageFacts
 from tcpipe.tables.findings import Finding, StageReport
 
@@ -486,7 +486,7 @@ class Sensor:
 class Streams:
     """L1: one checked table per role that the log has, and where each came from."""
 
-    tables: Mapping[str, pa.Table]
+    tables: Tables
     sensors: Mapping[str, Sensor]
     robot: str
     gnss_crs: str = "EPSG:4326"

@@ -154,6 +154,8 @@ PAPER_SCHEME = ClassScheme(PAPER_CLASSES, {entry.id: entry.id for entry in PAPER
 Pixels: TypeAlias = NDArray[np.uint8 | np.uint16 | np.float16 | np.float32 | np.float64]
 """Pixels of a layer: bytes or floats in a map, steps above the lowest pixel in a patch."""
 
+LayerPixels: TypeAlias = NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]
+"""Patches of one layer as they are stored, shape (N, px, px)."""
 Kind = Literal["continuous", "categorical", "relative"]
 Stack = Literal["relative", "floats", "greys", "classes"]
 
@@ -252,6 +254,10 @@ class Layer:
         return self.step / width, -self.low / width
 
 
+Layers: TypeAlias = Mapping[str, Layer]
+"""Layers of a map or a dataset, by name."""
+
+
 def find_no_data_value(dtype: np.dtype[np.generic]) -> float:
     """Return what stands for no data in a map's pixels of a type."""
     return float("nan") if dtype.kind == "f" else 0
@@ -300,12 +306,12 @@ def make_paper_layers(names: Iterable[str], classes: ClassTable) -> dict[str, La
     return {name: known[name] for name in names}
 
 
-def sort_layers(layers: Mapping[str, Layer]) -> dict[str, Layer]:
+def sort_layers(layers: Layers) -> dict[str, Layer]:
     """Return layers in the order of channels: the paper's first, then the others as they come."""
     return {name: layers[name] for name in LAYERS if name in layers} | dict(layers)
 
 
-def join_layers(maps: Sequence[Mapping[str, Layer]]) -> dict[str, Layer]:
+def join_layers(maps: Sequence[Layers]) -> dict[str, Layer]:
     """Return the layers that maps have in common, each with the range of all."""
     return {
         name: replace(layer, low=min(each[name].low for each in maps), high=max(each[name].high for each in maps))
@@ -313,7 +319,7 @@ def join_layers(maps: Sequence[Mapping[str, Layer]]) -> dict[str, Layer]:
     }
 
 
-def group_stacks(layers: Mapping[str, Layer]) -> dict[Stack, list[str]]:
+def group_stacks(layers: Layers) -> dict[Stack, list[str]]:
     """Return the names of layers by what they are sampled together with."""
     return {stack: [name for name, layer in layers.items() if layer.stack == stack] for stack in STACKS}
 

@@ -8,6 +8,7 @@ bound CRS.
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -25,6 +26,8 @@ from tcpipe.tables.findings import Findings, Subject, make_finding, read_thresho
 MAX_SCALE_ERROR = 0.01
 """A CRS whose unit is further from a metre of ground than this share is not metric enough to cut patches in."""
 
+Box: TypeAlias = tuple[float, float, float, float]
+"""Least x and y, greatest x and y."""
 _EARTH_RADIUS_M = 6_371_000.0
 
 
@@ -140,7 +143,7 @@ class Projection:
 
     source: CRS
     target: CRS
-    area_deg: tuple[float, float, float, float]
+    area_deg: Box
 
     @cached_property
     def _transformer(self) -> Transformer:
@@ -184,7 +187,7 @@ class Projection:
         return (make_finding("datum-shift-rough", subject, names=names, accuracy_m=accuracy_m),)
 
 
-def compute_area(crs: CRS, bounds: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+def compute_area(crs: CRS, bounds: Box) -> Box:
     """Return west, south, east, north [deg] of a rectangle (x min, y min, x max, y max) in a CRS."""
     transformer = Transformer.from_crs(crs, CRS(crs.geodetic_crs), always_xy=True)
     west, south, east, north = transformer.transform_bounds(*bounds)

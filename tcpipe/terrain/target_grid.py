@@ -22,7 +22,7 @@ from pyproj import CRS
 
 from tcpipe.arrays import Floats, Mask
 from tcpipe.errors import MapError
-from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, is_metric
+from tcpipe.terrain.projection import Box, Projection, compute_area, find_utm_crs, format_crs, is_metric
 
 LATTICE_STEP_PX = 16
 """Spacing of projected pixels, positions between are interpolated: error 1e-7 px for a site, 1e-3 px for a country."""
@@ -144,7 +144,7 @@ def choose_grid(
     return _cover(format_crs(crs), (x_min, y_min, x_max, y_max), (x_base, y_base), pitch)
 
 
-def _cover(crs: str, bounds_m: tuple[float, float, float, float], base_m: tuple[float, float], pitch: float) -> MapGrid:
+def _cover(crs: str, bounds_m: Box, base_m: tuple[float, float], pitch: float) -> MapGrid:
     """Return the smallest grid over ``bounds_m`` that has a corner of a pixel at ``base_m``."""
     (x_min, y_min, x_max, y_max), (x_base, y_base), slack = bounds_m, base_m, 1e-3
     left = x_base + math.floor((x_min - x_base) / pitch + slack) * pitch
@@ -215,7 +215,7 @@ class MapGrid:
     cols: int
 
     @property
-    def bounds_m(self) -> tuple[float, float, float, float]:
+    def bounds_m(self) -> Box:
         """Outer edges: x min, y min, x max, y max [m] in the map's CRS."""
         return (
             self.x_min_m,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Self
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.arrays import AnyArray, Floats, GenericArray, Ints
-from tcpipe.terrain.layers import STACKS, ClassTable, Layer, Stack, find_no_data_value, group_stacks
+from tcpipe.terrain.layers import STACKS, ClassTable, Layers, Stack, find_no_data_value, group_stacks
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 from tcpipe.terrain.resampling import choose_factor
 from tcpipe.terrain.sampling_kernel import Tiles, compute_morton
@@ -34,7 +34,7 @@ class MapReader(ABC):
     """The map's name in the store."""
     grid: MapGrid
     classes: ClassTable
-    layers: Mapping[str, Layer]
+    layers: Layers
     """Its layers by name; ``height``, the relative one, is always there."""
     tile_px: int
     """Side of the square tiles that are cheap to read, aligned with pixel (0, 0)."""

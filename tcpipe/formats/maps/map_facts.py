@@ -20,6 +20,7 @@ from tcpipe.terrain.layers import (
     make_continuous_layer,
     make_paper_layers,
 )
+from tcpipe.terrain.projection import Box
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ class MapSummary(MapFacts):
     rows: int
     cols: int
     pixel_size_m: float
-    bounds_m: tuple[float, float, float, float]
+    bounds_m: Box
     """West, south, east, north in the map's CRS."""
     layers: tuple[str, ...]
     overviews: tuple[int, ...]

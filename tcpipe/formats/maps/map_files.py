@@ -50,7 +50,16 @@ from tcpipe.formats.zarr_arrays import (
 )
 from tcpipe.tables.findings import omit
 from tcpipe.tables.levels import DATA_MODEL_VERSION
-from tcpipe.terrain.layers import PAPER_LAYERS, ClassScheme, ClassTable, Layer, Pixels, TerrainClass, find_no_data_value
+from tcpipe.terrain.layers import (
+    PAPER_LAYERS,
+    ClassScheme,
+    ClassTable,
+    Layer,
+    Layers,
+    Pixels,
+    TerrainClass,
+    find_no_data_value,
+)
 from tcpipe.terrain.resampling import iterate_levels, list_factors, make_overview_grid
 from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX, MapGrid
 from tcpipe.terrain.tiles import MapReader
@@ -262,9 +271,7 @@ def _level_path(factor: int) -> str:
 class MapWriter:
     """Writes a map and its overviews shard by shard into a directory; `finish` makes it complete."""
 
-    def __init__(
-        self, directory: Path, *, name: str, grid: MapGrid, scheme: ClassScheme, layers: Mapping[str, Layer]
-    ) -> None:
+    def __init__(self, directory: Path, *, name: str, grid: MapGrid, scheme: ClassScheme, layers: Layers) -> None:
         self._name, self._grid, self._scheme, self._layers = name, grid, scheme, layers
         self._factors = list_factors(grid)
         self._group = create_group(directory)
@@ -296,7 +303,7 @@ class MapWriter:
         )
         array[...] = colours
 
-    def finish(self, facts: MapFacts, layers: Mapping[str, Layer]) -> None:
+    def finish(self, facts: MapFacts, layers: Layers) -> None:
         """Write coordinates and attributes; ``layers`` are all those of before, with the range that was found."""
         reference_m = self.height_reference_m or 0.0
         for factor, arrays in self._levels.items():
@@ -361,7 +368,7 @@ def _place(group: Any, grid: MapGrid, title: str) -> None:
 _LONG_NAMES = {"height": "height of the ground", "ortho": "grey of the orthophoto", "terrain": "terrain class"}
 
 
-def _describe_layers(layers: Mapping[str, Layer]) -> dict[str, Description]:
+def _describe_layers(layers: Layers) -> dict[str, Description]:
     """Return the descriptions of layers other than the paper's."""
     return {name: describe_layer(layer) for name, layer in layers.items() if name not in PAPER_LAYERS}
 

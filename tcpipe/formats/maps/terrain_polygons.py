@@ -23,7 +23,7 @@ from tcpipe.formats.maps.layer_building import Tally, label_files
 from tcpipe.splits.regions import project_near
 from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 from tcpipe.terrain.layers import ClassScheme, Layer, Pixels, make_paper_layers, name_key
-from tcpipe.terrain.projection import Projection, compute_area
+from tcpipe.terrain.projection import Box, Projection, compute_area
 from tcpipe.terrain.target_grid import MapGrid
 
 PROPERTY = "class"
@@ -171,7 +171,7 @@ def _parse_integer(given: Any) -> int | None:
 
 
 def _project_polygons(
-    label: str, polygons: NDArray[np.object_], projection: Projection, bounds_m: tuple[float, float, float, float]
+    label: str, polygons: NDArray[np.object_], projection: Projection, bounds_m: Box
 ) -> NDArray[np.object_]:
     """Return the polygons in the map's CRS, empty where they are not on the map; `MapError` if none is."""
     west, south, east, north = projection.area_deg

@@ -37,7 +37,7 @@ from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, Verdict, make_finding, read_threshold
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LABELS
-from tcpipe.terrain.layers import LAYERS, PAPER_CLASSES, ClassTable, Layer
+from tcpipe.terrain.layers import LAYERS, PAPER_CLASSES, ClassTable, Layer, Layers
 
 VELOCITY_COLUMN = {"ground": "velocity_mps", "fused": "fused_velocity_mps"}
 """Column of samples.parquet that each choice of ``label.velocity`` trains on."""
@@ -133,7 +133,7 @@ def make_dataset_card(
     return replace(card, findings=findings, verdict=judge_dataset(findings, card.runs, card.maps))
 
 
-def _describe_tensor(layers: Mapping[str, Layer], classes: ClassTable) -> dict[str, str | tuple[str, ...]]:
+def _describe_tensor(layers: Layers, classes: ClassTable) -> dict[str, str | tuple[str, ...]]:
     """Return the channels of the tensor, and the formula of each layer."""
     return {
         "channels": tuple(name for name in LAYERS if name in layers),

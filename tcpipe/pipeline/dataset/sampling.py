@@ -1,7 +1,7 @@
 """Sampling of segments of all runs: near segments in parallel batches, pixels in a spool until they are written."""
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from tcpipe.arrays import AnyArray, Ints
 from tcpipe.errors import TcpipeError
 from tcpipe.execution import run_all, unwrap_result
-from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import make_mapped_array, move_rows_to_file, move_to_file, take_rows
 from tcpipe.formats.published_outputs import FetchedShards
@@ -24,7 +23,7 @@ from tcpipe.stages.sample import Sampled, Shifts, check_same_layers, sample_on_m
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import Findings
 from tcpipe.tables.levels import PLACED_SEGMENTS
-from tcpipe.terrain.layers import Layer, join_layers, sort_layers
+from tcpipe.terrain.layers import LayerPixels, Layers, join_layers, sort_layers
 from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.sampling_kernel import compute_morton
 from tcpipe.terrain.tiles import TilePool, choose_level
@@ -57,7 +56,7 @@ class Spool:
     """
 
     directory: Path
-    layers: Mapping[str, Layer]
+    layers: Layers
     patch_px: int
     counts: tuple[int, ...] = ()
     """Patches by batch."""
