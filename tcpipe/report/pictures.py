@@ -30,15 +30,10 @@ _CIVIDIS = np.array([[0, 34, 78], [65, 77, 107], [124, 123, 120], [188, 175, 111
 
 
 def make_picture_uri(pixels: Bytes, *, exact: bool = False) -> str:
-    """Return a picture as a data URI; arguments as of `encode_picture`."""
-    return f"data:image/webp;base64,{base64.b64encode(encode_picture(pixels, exact=exact)).decode('ascii')}"
-
-
-def encode_picture(pixels: Bytes, *, exact: bool = False) -> bytes:
-    """Return a picture, grey (R, C) or colour (R, C, 3), as WebP; ``exact`` keeps every pixel as it is."""
+    """Return a picture, grey (R, C) or colour (R, C, 3), as a data URI; ``exact`` keeps every pixel as it is."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, format="WEBP", quality=78, lossless=exact, method=4)
-    return stream.getvalue()
+    return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
 
 
 def read_picture(path: Path) -> Bytes | None:

@@ -274,7 +274,9 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
     at = truth.at(stamp)
     enu = at.enu_m + rotate(at.quat_xyzw, np.array(sensor.mounting.xyz_m))
     white_m = np.array([sensor.std_m, sensor.std_m, sensor.vertical_std_m])
-    lasting_m, lasts_s = _draw_lasting_noise(sensor, noise("gnss.drive"))
+    of_drive = noise("gnss.drive")
+    lasting_m = of_drive.uniform(*sensor.lasting_std_m) * np.array([1.0, 1.0, 1.7])  # satellites are all above
+    lasts_s = float(np.exp(of_drive.uniform(*np.log(sensor.lasts_s))))
     if faults.gnss_noise:
         enu = enu + white_m * noise("gnss.noise").standard_normal(enu.shape)
         enu = enu + lasting_m * _make_lasting_noise(stamp.size, 1.0 / (sensor.rate_hz * lasts_s), noise("gnss.lasting"))
@@ -301,12 +303,6 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
     jitter_s = sensor.stamp_jitter_s * noise("gnss.jitter").standard_normal(stamp.size)
     row = np.searchsorted(stamp, said.stamp_ns)
     return replace(said, stamp_ns=said.stamp_ns + np.round(1e9 * jitter_s).astype(np.int64)[row])
-
-
-def _draw_lasting_noise(sensor: Gnss, rng: np.random.Generator) -> tuple[Floats, float]:
-    """Return size [m], shape (3,), and correlation time [s] of the lasting part of one drive's noise."""
-    std_m, lasts_s = rng.uniform(*sensor.lasting_std_m), np.exp(rng.uniform(*np.log(sensor.lasts_s)))
-    return std_m * np.array([1.0, 1.0, 1.7]), float(lasts_s)  # satellites are all above
 
 
 def _make_lasting_noise(count: int, step: float, rng: np.random.Generator) -> Floats:
