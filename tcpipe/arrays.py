@@ -1,5 +1,6 @@
 """Types of arrays, by their elements."""
 
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,3 +15,6 @@ AnyInts: TypeAlias = NDArray[np.integer]
 Texts: TypeAlias = NDArray[np.str_]
 GenericArray: TypeAlias = NDArray[np.generic]
 AnyArray: TypeAlias = NDArray[Any]
+NamedArrays: TypeAlias = Mapping[str, AnyArray]
+Columns: TypeAlias = NamedArrays
+"""Arrays of one length, by the names of a table's columns."""

@@ -37,12 +37,12 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression, nnls
 from scipy.special import ndtr, ndtri, stdtrit
 
-from tcpipe.arrays import AnyInts, Floats, GenericArray, Ints, Mask
+from tcpipe.arrays import AnyInts, Floats, Ints, Mask, NamedArrays
 
 Classes = NDArray[np.integer]
 Stated = Floats | float | None
 Near = Mask | None
-Residuals = Mapping[str, GenericArray]
+Residuals = NamedArrays
 
 COVERAGE = 0.9
 """Share of drives that an interval is to cover."""

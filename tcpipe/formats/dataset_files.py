@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.arrays import AnyArray, Ints, Texts
+from tcpipe.arrays import AnyArray, Ints, NamedArrays, Texts
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
@@ -347,7 +347,7 @@ class PatchFiles:
                     array = self.arrays[layer]
                     array.expect((piece, *(0 for _ in array.shape[1:])) for piece in pieces)
 
-    def read(self, piece: int, layers: Iterable[str], out: Mapping[str, AnyArray] | None = None) -> dict[str, AnyArray]:
+    def read(self, piece: int, layers: Iterable[str], out: NamedArrays | None = None) -> dict[str, AnyArray]:
         """Return layers of one piece, each of shape (rows, *patch); `DatasetError` if it cannot be read.
 
         ``out`` has `piece_rows` or more rows a layer; None makes new arrays.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tcpipe.arrays import GenericArray
+from tcpipe.arrays import GenericArray, NamedArrays
 from tcpipe.errors import ModelError
 from tcpipe.formats.atomic import write_atomic_file
 
@@ -15,7 +15,7 @@ ArrayForm = tuple[str, tuple[int | str, ...]]
 """Type and shape of an array; a name stands for any length, and for the same one wherever it stands."""
 
 
-def write_arrays(path: Path, arrays: Mapping[str, GenericArray]) -> None:
+def write_arrays(path: Path, arrays: NamedArrays) -> None:
     """Write the arrays, whole or not at all."""
     with write_atomic_file(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, allow_pickle=False, **dict(arrays))
@@ -53,7 +53,7 @@ def _require_plain_arrays(path: Path) -> None:
         raise ValueError("compressed, or larger than the file; expected plain arrays")
 
 
-def check_arrays(arrays: Mapping[str, GenericArray], forms: Mapping[str, ArrayForm]) -> None:
+def check_arrays(arrays: NamedArrays, forms: Mapping[str, ArrayForm]) -> None:
     """Raise `ModelError` unless arrays have these names, types and shapes."""
     if wrong := _find_wrong_form({name: (array.dtype.name, array.shape) for name, array in arrays.items()}, forms):
         raise ModelError(f"contains the weights of another model: {wrong}; train the model again")

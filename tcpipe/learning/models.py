@@ -10,7 +10,6 @@
 """
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.arrays import Floats, Floats32, GenericArray, Mask
+from tcpipe.arrays import Floats, Floats32, Mask, NamedArrays
 from tcpipe.cost.prediction_errors import QuantityErrors, estimate_correlation, fit_errors
 from tcpipe.dataset.extra_features import ExtraFeatures, empty_extra_features, fill_unknown
 from tcpipe.errors import ModelError, StoreError, UsageError
@@ -37,7 +36,6 @@ from tcpipe.splits.audit import CLOSE, are_near
 
 logger = logging.getLogger("tcpipe")
 
-Arrays = Mapping[str, GenericArray]
 
 FILES = CARD, WEIGHTS, RESIDUALS, GROUND, HISTORY = (
     "model.json",
@@ -62,7 +60,7 @@ class Model:
     place: Path
     checksum: str
     """Checksum of card and weights, which determine its predictions."""
-    residuals: Mapping[str, GenericArray] = field(default_factory=dict)
+    residuals: NamedArrays = field(default_factory=dict)
     """Columns of the held-out samples: run_id, start_ns, terrain_class, labels, predictions."""
     own: OwnKind | None = None
     """The user's code."""
@@ -142,7 +140,7 @@ class Model:
 
 
 def write_model(
-    out: Location, *, card: ModelCard, weights: Arrays, residuals: pa.Table, ground: pa.Table, history: str
+    out: Location, *, card: ModelCard, weights: NamedArrays, residuals: pa.Table, ground: pa.Table, history: str
 ) -> None:
     """Write a model folder, or the newest build at a URL, complete or not at all."""
     with publish_directory(out, CARD) as directory:

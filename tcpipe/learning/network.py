@@ -20,12 +20,10 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from tcpipe.arrays import Floats32, GenericArray
+from tcpipe.arrays import Floats32, NamedArrays
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import check_arrays
 from tcpipe.learning.fitting import mean_loss
-
-Arrays = Mapping[str, GenericArray]
 
 _TOGETHER = 256
 """Patches in one forward pass."""
@@ -101,14 +99,14 @@ class ResNet18(nn.Module):
         return {name: value.numpy(force=True).copy(order="C") for name, value in self._list_weights().items()}
 
     @classmethod
-    def from_arrays(cls, depth: int, outputs: int, width: int, *, arrays: Arrays) -> ResNet18:
+    def from_arrays(cls, depth: int, outputs: int, width: int, *, arrays: NamedArrays) -> ResNet18:
         """Return a network with its weights; `ModelError` for weights of other sizes, before memory is allocated."""
         with torch.device("meta"):
             network = cls(depth, outputs, width)
         network.load(arrays)
         return network
 
-    def load(self, arrays: Arrays) -> None:
+    def load(self, arrays: NamedArrays) -> None:
         """Set the weights and move to the device; `ModelError` if they are another network's."""
         forms = {name: ("float32", tuple(value.shape)) for name, value in self._list_weights().items()}
         check_arrays(arrays, forms)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from tcpipe.arrays import Floats32, GenericArray
+from tcpipe.arrays import Floats32, NamedArrays
 from tcpipe.dataset.extra_features import (
     COLUMNS,
     ExtraFeatures,
@@ -37,7 +37,6 @@ from tcpipe.learning.predictor import (
 if TYPE_CHECKING:
     from tcpipe.learning.network import ResNet18, Trainer
 
-Arrays = Mapping[str, GenericArray]
 
 logger = logging.getLogger("tcpipe")
 
@@ -120,12 +119,12 @@ class NetworkModel(Predictor):
         numbers = standardize_features(self.inputs.extra_features, features)
         return self.network.predict(append_planes(patches, numbers)) * np.array(self.inputs.scale, np.float32)
 
-    def to_arrays(self) -> Arrays:
+    def to_arrays(self) -> NamedArrays:
         """Return every weight by its path in the network."""
         return self.network.arrays()
 
     @classmethod
-    def from_arrays(cls, arrays: Arrays, inputs: Inputs) -> NetworkModel:
+    def from_arrays(cls, arrays: NamedArrays, inputs: Inputs) -> NetworkModel:
         """Return the network with these weights; its width is that of the first ones."""
         sizes = inputs.depth, len(inputs.outputs), arrays.get("stem.convolution.weight", np.empty(1)).shape[0]
         check_trainable(*sizes)

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from tcpipe.arrays import AnyArray, Floats, GenericArray, Ints
+from tcpipe.arrays import AnyArray, Floats, GenericArray, Ints, NamedArrays
 from tcpipe.cost.physics import ALL, FEWEST, FitSamples, Physics, fit_physics
 from tcpipe.dataset import Split
 from tcpipe.dataset.energies import ENERGIES
@@ -71,7 +71,7 @@ class PhysicsModel(Predictor):
         return {**{name: getattr(self, name) for name in _NUMBERS}, **self.speed.arrays()}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, AnyArray], inputs: Inputs) -> PhysicsModel:
+    def from_arrays(cls, arrays: NamedArrays, inputs: Inputs) -> PhysicsModel:
         """Return the model of these arrays."""
         del inputs
         check_arrays(arrays, {**_FORMS, **list_curve_arrays(1)})
@@ -183,7 +183,7 @@ def list_curve_arrays(outputs: int) -> dict[str, ArrayForm]:
     return {f"{_STORED}{name}": form for name, form in forms.items()}
 
 
-def read_curves(arrays: Mapping[str, AnyArray]) -> tuple[Curves, dict[str, AnyArray]]:
+def read_curves(arrays: NamedArrays) -> tuple[Curves, dict[str, AnyArray]]:
     """Return the curves of `Curves.arrays` and the other arrays; `ModelError` without valid curves."""
     rest = dict(arrays)
     curves = Curves(*(rest.pop(f"{_STORED}{name}") for name in _ARRAYS))
@@ -221,7 +221,7 @@ class CurveModel(Predictor):
         return self.curves.arrays()
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, AnyArray], inputs: Inputs) -> CurveModel:
+    def from_arrays(cls, arrays: NamedArrays, inputs: Inputs) -> CurveModel:
         """Return the model of these curves."""
         check_arrays(arrays, list_curve_arrays(len(inputs.outputs)))
         return cls(read_curves(arrays)[0])

@@ -31,7 +31,7 @@ from typing import ClassVar, Protocol, TypeAlias, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import AnyArray, Floats, Floats32, GenericArray, Ints, Mask
+from tcpipe.arrays import Floats, Floats32, GenericArray, Ints, Mask, NamedArrays
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import ExtraFeature, ExtraFeatures, read_extra_features
 from tcpipe.errors import ModelError
@@ -39,7 +39,6 @@ from tcpipe.learning.fitting import FitConfig, ModelKind, TrainingTimes, compute
 
 Patches: TypeAlias = Floats32
 Labels: TypeAlias = NDArray[np.floating]
-Arrays: TypeAlias = Mapping[str, AnyArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,12 +196,12 @@ class Predictor(Protocol):
         whole = cls.fit(samples)
         return Fitted(whole, held_out, training_times_s=TrainingTimes(time.perf_counter() - began, len(samples)))
 
-    def to_arrays(self) -> Arrays:
+    def to_arrays(self) -> NamedArrays:
         """Return all that `from_arrays` needs."""
         return {}
 
     @classmethod
-    def from_arrays(cls, arrays: Arrays, inputs: Inputs) -> Predictor:
+    def from_arrays(cls, arrays: NamedArrays, inputs: Inputs) -> Predictor:
         """Return the model of `to_arrays`; `ModelError` where the arrays are those of another."""
         del arrays, inputs
         return cls()

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import AnyArray, Floats, Floats32, GenericArray, Ints
+from tcpipe.arrays import Floats, Floats32, GenericArray, Ints, NamedArrays
 from tcpipe.dataset.extra_features import ExtraFeatures, standardize_features
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm, check_arrays
@@ -249,7 +249,7 @@ class BoostingModel(Predictor):
         return {**texts, **self.curves.arrays()}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, AnyArray], inputs: Inputs) -> BoostingModel:
+    def from_arrays(cls, arrays: NamedArrays, inputs: Inputs) -> BoostingModel:
         """Return the model of these arrays."""
         texts: dict[str, ArrayForm] = {f"trees_{at}": ("uint8", (f"bytes_{at}",)) for at in range(len(inputs.outputs))}
         check_arrays(arrays, {**texts, **list_curve_arrays(len(inputs.outputs))})

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Columns, Floats, Ints
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_message_fields, utc_from_gps_ns
-from tcpipe.logs.fix_quality import Columns, classify_fixes, find_status
+from tcpipe.logs.fix_quality import classify_fixes, find_status
 from tcpipe.logs.messages import GNSS
 from tcpipe.logs.roles import GPS_FIXES
 from tcpipe.logs.topics import AutopilotKind

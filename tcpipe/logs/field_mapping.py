@@ -12,7 +12,7 @@ from itertools import islice
 
 import numpy as np
 
-from tcpipe.arrays import AnyArray, Floats, Ints
+from tcpipe.arrays import AnyArray, Columns, Floats, Ints
 from tcpipe.logs import roles
 from tcpipe.logs.expressions import (
     FORM,
@@ -28,8 +28,6 @@ from tcpipe.logs.power_fields import match_sided_velocities
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.wire_types import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity
-
-Columns = Mapping[str, AnyArray]
 
 
 @dataclass(frozen=True, slots=True)

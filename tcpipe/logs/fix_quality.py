@@ -11,10 +11,8 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import AnyArray, Floats, Ints
+from tcpipe.arrays import AnyArray, Columns, Floats, Ints
 from tcpipe.logs.expressions import simplify_name
-
-Columns = Mapping[str, AnyArray]
 
 NO_HEIGHT_M2 = 1e6
 """Variance of a height that is not measured."""

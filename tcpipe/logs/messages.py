@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.arrays import AnyArray, Floats, Ints, Mask
+from tcpipe.arrays import AnyArray, Columns, Floats, Ints, Mask
 from tcpipe.geometry.rotation import normalize
 from tcpipe.logs import roles
 from tcpipe.logs.extrinsics import is_base
 from tcpipe.logs.fix_quality import (
     NO_HEIGHT_M2,
-    Columns,
     add_quality_std,
     classify_fixes,
     classify_status,

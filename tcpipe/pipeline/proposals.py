@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 import numpy as np
 import pyarrow.compute as pc
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Columns, Floats
 from tcpipe.errors import LogError, TcpipeError, UsageError, clean_line
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.finding_lines import describe_finding, format_number
@@ -30,7 +30,6 @@ from tcpipe.logs.expressions import UNITS, parse_expression, simplify_name, spli
 from tcpipe.logs.field_mapping import (
     MAPPED,
     MAPPED_TYPES,
-    Columns,
     find_other_unit,
     list_number_fields,
     match_field_names,

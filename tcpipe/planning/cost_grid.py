@@ -6,12 +6,12 @@ passing another's centre: (1, 0), (2, 1), (1, 1), (1, 2) and so on: 0°, 26.6°,
 the grid's east. A path of such steps is at most 1 / cos(13.3°) - 1 = 2.8 % longer than a straight line.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from tcpipe.arrays import Bytes, Floats, Floats32, GenericArray, Ints, Mask
+from tcpipe.arrays import Bytes, Floats, Floats32, GenericArray, Ints, Mask, NamedArrays
 from tcpipe.errors import MapError
 from tcpipe.learning.models import Model
 from tcpipe.planning.cost_model import BATCH, NO_COST, Bits, Reason, SegmentPredictions, iterate_predictions
@@ -135,7 +135,7 @@ class CostGrid:
         shapes = {"power_watt": COURSES, "velocity_mps": COURSES, "reasons": COURSES, "height_m": 1}
         return {name: getattr(self, name).reshape(count, -1)[:, cells] for name, count in shapes.items()}
 
-    def load(self, cells: Cells, arrays: Mapping[str, GenericArray]) -> None:
+    def load(self, cells: Cells, arrays: NamedArrays) -> None:
         """Write the arrays of `take`."""
         for name, values in arrays.items():
             getattr(self, name).reshape(len(values), -1)[:, cells] = values

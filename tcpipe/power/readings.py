@@ -6,14 +6,13 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Columns, Floats
 from tcpipe.power.audit import measure_sag
 from tcpipe.power.plausibility import EXCLUDED, REJECTED, find_isolated, find_missing_rows, undo_overflow
 from tcpipe.power.rails import UNIT_VOLT, is_power_only, make_rail, make_samples
 from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
-    Columns,
     HuskyPower,
     JointPower,
     RailReadings,

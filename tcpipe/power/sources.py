@@ -21,13 +21,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tcpipe.arrays import AnyArray, Floats, Ints, Mask, Texts
+from tcpipe.arrays import Columns, Floats, Ints, Mask, Texts
 from tcpipe.power.plausibility import REJECTED
 from tcpipe.power.rails import UNIT_VOLT, is_power_only
 from tcpipe.robots import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
-Columns = Mapping[str, AnyArray]
 HuskyPower = Literal["battery", "drivers"]
 
 NAMES, SPEED, TORQUE = "name[]", "velocity", "effort"

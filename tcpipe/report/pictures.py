@@ -3,7 +3,7 @@
 import base64
 import io
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import pyarrow as pa
 from PIL import Image, ImageColor, UnidentifiedImageError
 from pyproj import Transformer
 
-from tcpipe.arrays import AnyArray, Bytes, Floats, GenericArray, Ints
+from tcpipe.arrays import AnyArray, Bytes, Floats, GenericArray, Ints, NamedArrays
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches
@@ -223,7 +223,7 @@ def _select_rows(samples: pa.Table, piece: Ints) -> Ints:
     return np.sort(np.array([row for _, row in sorted(order)[:MOST_PATCHES]], np.int64))
 
 
-def _join_colours(pixels: Mapping[str, AnyArray]) -> Mapping[str, AnyArray]:
+def _join_colours(pixels: NamedArrays) -> NamedArrays:
     """Return one orthophoto in colour, (N, px, px, 3), in the place of its grey and its three colours."""
     if not set(COLOURS) <= set(pixels):
         return pixels

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Columns, Floats
 from tcpipe.logs.expressions import UNITS
-from tcpipe.logs.field_mapping import Columns, list_number_fields, match_field_names
+from tcpipe.logs.field_mapping import list_number_fields, match_field_names
 from tcpipe.logs.power_fields import match_power_fields, split_sides, split_words
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES, RoleAssignment
 from tcpipe.logs.topics import Topic

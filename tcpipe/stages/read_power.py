@@ -7,8 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from tcpipe.arrays import Floats, Ints
-from tcpipe.logs.field_mapping import Columns
+from tcpipe.arrays import Columns, Floats, Ints
 from tcpipe.logs.messages import LOG_TIME, Readings, read_header_ns
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic

@@ -11,12 +11,13 @@ from typing import cast, get_args
 import numpy as np
 import pyarrow as pa
 
+from tcpipe.arrays import Columns
 from tcpipe.errors import MapError, RecipeError, RoleError
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.clocks import TopicTimeline
 from tcpipe.logs.expressions import UNITS
 from tcpipe.logs.extrinsics import IDENTITY, Pose, Tree, build_static_tree, find_base_link_from, is_base
-from tcpipe.logs.field_mapping import MAPPED_TYPES, Columns, make_mapped_message
+from tcpipe.logs.field_mapping import MAPPED_TYPES, make_mapped_message
 from tcpipe.logs.messages import (
     LOG_TIME,
     Readings,

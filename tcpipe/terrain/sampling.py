@@ -14,14 +14,14 @@ patch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import AnyArray, Bytes, Floats, Ints, Mask
+from tcpipe.arrays import AnyArray, Bytes, Floats, Ints, Mask, NamedArrays
 from tcpipe.errors import TableError
 from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M, STACKS, group_stacks
@@ -50,7 +50,7 @@ class Patches:
     and front edge above the smallest [m], NaN without data, (N, 3).
     """
 
-    pixels: Mapping[str, AnyArray]
+    pixels: NamedArrays
     height_min_m: Floats
     slope_rad: Floats
     cross_slope_rad: Floats

@@ -22,7 +22,7 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from tcpipe.arrays import AnyArray, Bytes, Ints
+from tcpipe.arrays import Bytes, Ints, NamedArrays
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import write_atomic_directory, write_atomic_file
 from tcpipe.formats.logs.ros_types import load_shipped_definitions
@@ -46,7 +46,7 @@ class MessageStream:
     topic: str
     type_name: str
     log_time_ns: Ints
-    columns: Mapping[str, AnyArray] = field(default_factory=dict)
+    columns: NamedArrays = field(default_factory=dict)
     constants: Mapping[str, Any] = field(default_factory=dict)
     publish_time_ns: Ints | None = None
     latched: bool = False
@@ -143,7 +143,7 @@ def _serialize_messages(stream: MessageStream, encoding: Encoding) -> Bytes:
     return rows
 
 
-def _check_lengths(topic: str, columns: Mapping[str, AnyArray]) -> None:
+def _check_lengths(topic: str, columns: NamedArrays) -> None:
     """Refuse what cannot be patched in: strings of several lengths, and arrays of Python objects."""
     for name, values in columns.items():
         ragged = values.dtype.kind == "S" and (np.char.str_len(values) != values.dtype.itemsize).any()
