@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pyarrow as pa
 import pytest
@@ -11,6 +13,9 @@ import pytest
 from tcpipe.formats.json_files import to_plain
 from tcpipe.recipe import FuseConfig
 from tcpipe.simulation import SimulatedSite, simulate
+from tcpipe.simulation.scenarios import RasterSpec
+from tcpipe.simulation.site_files import write_rasters
+from tcpipe.simulation.world import World
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.tables.levels import Streams, Track
 
@@ -43,4 +48,21 @@ def fused_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tcpipe.stages.fuse.fuse_run", fuse)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def drawn_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Draw the rasters of a world once, most of a simulation, however many sites lie in it."""
+    drawn: dict[str, Path] = {}
+
+    def write(directory: Path, world: World, spec: RasterSpec) -> None:
+        key = repr((world, spec))
+        if key not in drawn:
+            drawn[key] = tmp_path_factory.mktemp("drawn")
+            write_rasters(drawn[key], world, spec)
+        shutil.copytree(drawn[key], directory)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tcpipe.simulation.site_files.write_rasters", write)
         yield

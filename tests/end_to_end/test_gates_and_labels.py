@@ -13,6 +13,7 @@ from tcpipe.robots import Robot
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario, make_tiny, read_truth, simulate
 from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.robot import SimulatedRobot
+from tcpipe.simulation.scenarios import RasterSpec
 from tcpipe.simulation.sensors import Imu, WheelOdometry
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.label import label_segments
@@ -22,12 +23,15 @@ from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import to_floats, to_integers
 
+COARSE = RasterSpec(1.0, 1.0, 1.0)
+"""Rasters that no test looks at."""
 
-def run(site, *, config=None):
+
+def run(site):
     with open_log(site.logs[0]) as log:
         streams = read_run(log, ReadConfig(), robot="husky", known=load_shipped_profiles())
     track = fuse_run(streams, FuseConfig(), run_id="run")
-    masked = mask_track(track, config or MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    masked = mask_track(track, MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
     segments = segment_track(masked, SegmentConfig())
     labelled = label_segments(
         segments,
@@ -46,7 +50,7 @@ def manoeuvres(tmp_path_factory):
     noisy = Faults(
         gnss_noise=True, imu_noise=True, wheel_noise=True, wheel_slip=True, visual_noise=True, power_noise=True
     )
-    plan = replace(plan, drives=tuple(replace(drive, faults=noisy) for drive in plan.drives))
+    plan = replace(plan, drives=tuple(replace(drive, faults=noisy) for drive in plan.drives), rasters=COARSE)
     return run(simulate(tmp_path_factory.mktemp("manoeuvres"), scenario=plan, seed=3))
 
 
@@ -105,7 +109,7 @@ def test_no_segment_contains_standing_or_turning_in_place(manoeuvres):
 def faulty(tmp_path_factory):
     """Two minutes with every sensor fault, from a ROS 1 bag; the demo of test_whole_pipeline.py is a ROS 2 log."""
     plan = make_tiny(Faults.every(), recorder=Recorder("ros1", "husky_status"), seconds=110.0)
-    return run(simulate(tmp_path_factory.mktemp("faulty"), scenario=plan, seed=4))
+    return run(simulate(tmp_path_factory.mktemp("faulty"), scenario=replace(plan, rasters=COARSE), seed=4))
 
 
 def spans(labelled):
