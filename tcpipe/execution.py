@@ -27,15 +27,13 @@ from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar, cast
 
 from tcpipe import __version__
 from tcpipe.errors import TcpipeError, UsageError, clean_line
-from tcpipe.progress import STEP, step_of
+from tcpipe.progress import STEP, logger, step_of
 
 if TYPE_CHECKING:
     from distributed import Client
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-logger = logging.getLogger("tcpipe")
 
 Said: TypeAlias = tuple[Any, ...]
 """Arguments of `Logger.log`."""

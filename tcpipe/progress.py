@@ -12,7 +12,7 @@ STEP = 15
 _LONGEST_NAME = 200
 _TEXT = "%s: %s, %d of %d"
 
-_logger = logging.getLogger("tcpipe")
+logger = logging.getLogger("tcpipe")
 _task: ContextVar[str] = ContextVar("task", default="")
 
 
@@ -39,7 +39,7 @@ def set_task(task: str) -> Iterator[None]:
 
 def step(stage: str, done: int = 0, total: int = 0) -> None:
     """Log the progress of this thread's task."""
-    _logger.log(STEP, _TEXT, _task.get(), stage, done, total)
+    logger.log(STEP, _TEXT, _task.get(), stage, done, total)
 
 
 def step_of(record: logging.LogRecord) -> Step | None:

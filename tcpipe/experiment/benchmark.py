@@ -6,7 +6,6 @@
     DATASET/KIND-SEED/model, evaluation     each training, and its evaluation; what is complete is not made again
 """
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,10 +29,9 @@ from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Ratio, mean_k
 from tcpipe.learning.predictions import compute_cost_errors, make_column_name
 from tcpipe.learning.predictor import find_kind
 from tcpipe.learning.training import train
+from tcpipe.progress import logger
 from tcpipe.report.page import PageSection, render_page
 from tcpipe.tables.columns import to_floats, to_texts
-
-logger = logging.getLogger("tcpipe")
 
 JSON, PAGE = "benchmark.json", "benchmark.html"
 

@@ -3,7 +3,6 @@
 Each takes as many steps as the one network, and is centred by class by the same rule.
 """
 
-import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,8 +20,7 @@ from tcpipe.learning.network_model import NetworkModel
 from tcpipe.learning.predictions import Predicted, collect_measured, predict_costs
 from tcpipe.learning.predictor import Fitted, Job, Prediction, Samples, find_held_out, predict_samples
 from tcpipe.learning.training import make_training_samples
-
-logger = logging.getLogger("tcpipe")
+from tcpipe.progress import logger
 
 Batch = tuple[Floats32, Floats32]
 

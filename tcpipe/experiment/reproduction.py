@@ -1,6 +1,5 @@
 """``tcpipe reproduce``: the paper's experiment from a simulated site to its claims; every stage resumes."""
 
-import logging
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,11 +19,10 @@ from tcpipe.learning.fitting import FitConfig
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
+from tcpipe.progress import logger
 from tcpipe.recipe import Recipe
 from tcpipe.report.page import PageSection, render_page
 from tcpipe.simulation import SimulatedSite, find_scenario, simulate
-
-logger = logging.getLogger("tcpipe")
 
 JSON, PAGE = "reproduction.json", "reproduction.html"
 SIMULATED = "The data are simulated: compare the pattern with the paper, not the numbers."

@@ -18,7 +18,6 @@ smallest digest.
 """
 
 import hashlib
-import logging
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -34,9 +33,8 @@ from tcpipe.formats.json_files import parse_typed_json, to_compact_json, to_json
 from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
 from tcpipe.formats.runs import Call, LogFailure, LogSnapshot, Output, Problem, RunFacts, StoredMap, Tags, find_lineage
+from tcpipe.progress import logger
 from tcpipe.tables.findings import Subject, make_finding
-
-logger = logging.getLogger("tcpipe")
 
 Kind: TypeAlias = Literal["calls", "runs", "failed", "tags", "seen", "acknowledged", "maps", "outputs"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,9 +22,8 @@ from tcpipe.learning.physics_model import MeanModel
 from tcpipe.learning.predictions import Measured, Predicted
 from tcpipe.learning.predictor import Job, Prediction, Predictor, Samples, find_kind, predict_samples
 from tcpipe.learning.training import make_training_samples
+from tcpipe.progress import logger
 from tcpipe.tables.findings import Finding, Subject, make_finding
-
-logger = logging.getLogger("tcpipe")
 
 BASELINES: Mapping[str, type[Predictor]] = {
     "mean per class": MeanModel,

@@ -1,6 +1,5 @@
 """Evaluation as in the paper's section V for any model and dataset: tables I to III and V, with the noise floor."""
 
-import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal, TypeAlias
@@ -40,6 +39,7 @@ from tcpipe.learning.predictions import (
     predict_spreads,
 )
 from tcpipe.learning.training import compute_dataset_checksum
+from tcpipe.progress import logger
 from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, LOCAL_PLACES, PLACES, are_near, compute_middles
 from tcpipe.tables.bounds import Bounds
@@ -58,8 +58,6 @@ from tcpipe.tables.findings import (
     read_threshold,
 )
 from tcpipe.terrain.layers import NODATA_ID
-
-logger = logging.getLogger("tcpipe")
 
 KIND = "tcpipe evaluation"
 

@@ -9,7 +9,6 @@
     history.csv        losses of every epoch
 """
 
-import logging
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,10 +31,8 @@ from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
 from tcpipe.learning.own_models import OwnKind, load_own_kind, report_errors
 from tcpipe.learning.predictor import Prediction, Predictor, ask_predictor, find_kind
+from tcpipe.progress import logger
 from tcpipe.splits.audit import CLOSE, are_near
-
-logger = logging.getLogger("tcpipe")
-
 
 FILES = CARD, WEIGHTS, RESIDUALS, GROUND, HISTORY = (
     "model.json",

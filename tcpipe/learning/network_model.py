@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -33,12 +32,11 @@ from tcpipe.learning.predictor import (
     compute_held_loss,
     predict_samples,
 )
+from tcpipe.progress import logger
 
 if TYPE_CHECKING:
     from tcpipe.learning.network import ResNet18, Trainer
 
-
-logger = logging.getLogger("tcpipe")
 
 BLOCK, _MOST_WIDTH, _MOST_INPUTS = 16, 512, 1024
 """Channels combined by CPU convolutions: with fewer, oneDNN, which PyTorch uses there, writes beyond its memory in the

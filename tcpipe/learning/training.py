@@ -40,11 +40,10 @@ from tcpipe.learning.predictor import (
     find_held_out,
     find_kind,
 )
+from tcpipe.progress import logger
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles
 from tcpipe.terrain.layers import COLOURS, LAYERS, NODATA_ID, PAPER_CLASSES, PAPER_LAYERS, ClassTable
 from tcpipe.terrain.sampling import compute_relief_m
-
-logger = logging.getLogger("tcpipe")
 
 _READ_TOGETHER = 1024
 

@@ -1,6 +1,5 @@
 """Calls on a store: the record of each call, open and killed calls, durations of calls, and estimates from these."""
 
-import logging
 import os
 import resource
 import secrets
@@ -19,10 +18,9 @@ from tcpipe.execution import read_cluster_cpu_s
 from tcpipe.formats.documents import State, parse_name
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.runs import Call, Problem, Process
+from tcpipe.progress import logger
 from tcpipe.store import Store, is_store
 from tcpipe.tables.findings import Remedy, Subject, make_finding
-
-logger = logging.getLogger("tcpipe")
 
 
 def identify_process() -> Process:

@@ -1,6 +1,5 @@
 """From logs to labelled segments in the store: one task a log, side by side, each whole or not at all."""
 
-import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
@@ -32,6 +31,7 @@ from tcpipe.pipeline.plan import (
     plan_ingestion,
 )
 from tcpipe.pipeline.problems import is_acknowledged
+from tcpipe.progress import logger
 from tcpipe.recipe import Recipe, TimeWindow
 from tcpipe.store import is_store, open_store
 from tcpipe.tables.findings import select_problems
@@ -65,8 +65,6 @@ def iterate_rounds(steps: Sequence[PlannedLog]) -> list[list[Item]]:
             sizes.add(size_bytes)
     return rounds
 
-
-logger = logging.getLogger("tcpipe")
 
 _NO_LOGS = "no logs given; expected .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them or of tables"
 
@@ -269,7 +267,7 @@ def _record_result(call: RunningCall, task: IngestTask, ended: Ingested, known: 
             if state.find_seen(source.origins) != seen:
                 call.store.put(state, "seen", make_key(find_lineage(source.origins)), seen)
     except StoreError as error:
-        logger.error("%s", error)  # noqa: TRY400  one line
+        logger.error("%s", error)
     if result.status == "failed":
         problem = make_failure(result.sha256 or source.files_digest, source.origins)
         return replace(result, acknowledged=result.acknowledged or is_acknowledged([problem], state))

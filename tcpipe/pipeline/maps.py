@@ -1,7 +1,6 @@
 """Add a map to the store: rasters of one site on one common grid."""
 
 import glob
-import logging
 import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,13 +20,12 @@ from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.runs import StoredMap
 from tcpipe.pipeline.calls import ADD_MAP, RunningCall, record_call
 from tcpipe.pipeline.options import AddMapOptions, Files
+from tcpipe.progress import logger
 from tcpipe.report.pictures import draw_ortho, write_overview
 from tcpipe.store import Store, check_map_name, open_store
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.tables.options import as_function
 from tcpipe.terrain.layers import ClassScheme, find_wrong_name
-
-logger = logging.getLogger("tcpipe")
 
 ROLES = ("height", "ortho", "terrain", "classes")
 CLASSES = "classes"

@@ -1,6 +1,5 @@
 """Tasks and results of ``ingest``, and the decision for each log, which ``--dry-run`` and ``status`` show, too."""
 
-import logging
 import time
 import traceback
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -16,13 +15,12 @@ from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.runs import Call, LogFailure, RunFacts, find_problems, make_failure
 from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient, recall_hash
+from tcpipe.progress import logger
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import Findings, Verdict, select_problems
 from tcpipe.tables.levels import DATA_MODEL_VERSION, RESULTS_VERSION
 
 R = TypeVar("R")
-
-logger = logging.getLogger("tcpipe")
 
 Status = Literal["done", "unchanged", "damaged", "empty", "failed", "waiting"]
 

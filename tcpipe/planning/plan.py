@@ -9,7 +9,6 @@ turns and without, as steps and as straight lines, and for ``risk`` with several
 a cell added to its cost. The returned path is the one with the least cost predicted by `tcpipe predict-path`.
 """
 
-import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -33,11 +32,10 @@ from tcpipe.planning.search import (
     make_steps,
     straighten_path,
 )
+from tcpipe.progress import logger
 from tcpipe.tables.bits import flag_names
 from tcpipe.terrain.layers import NODATA_ID
 from tcpipe.terrain.sampling import find_classes_at
-
-logger = logging.getLogger("tcpipe")
 
 Classes = Bytes
 Objective = Literal["energy", "time", "distance"]

@@ -1,6 +1,5 @@
 """Building a dataset from labelled segments and maps: sample, split, audit, write; complete or not at all."""
 
-import logging
 import shlex
 from collections.abc import Collection, Container, Iterator, Sequence
 from contextlib import contextmanager
@@ -32,12 +31,11 @@ from tcpipe.pipeline.dataset.inputs import ChosenInputs, choose_inputs, find_oth
 from tcpipe.pipeline.dataset.options import BuildOptions, merge_recipe, read_build_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.options import BuildDatasetOptions
+from tcpipe.progress import logger
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Findings, is_problem, select_problems
 from tcpipe.tables.options import as_function
-
-logger = logging.getLogger("tcpipe")
 
 
 @dataclass(frozen=True, slots=True)

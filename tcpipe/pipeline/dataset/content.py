@@ -5,7 +5,6 @@ Columns of the samples beyond their schema: the tags of their runs, and covariat
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -43,6 +42,7 @@ from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import list_needs, move_losses, pool_segments
 from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
 from tcpipe.pipeline.dataset.splitting import draw_splits, number_runs
+from tcpipe.progress import logger
 from tcpipe.recipe import CovariateConfig, Recipe, SplitConfig
 from tcpipe.recipe.suggestions import format_recipe_key, suggest
 from tcpipe.robots import Robot
@@ -55,8 +55,6 @@ from tcpipe.tables.levels import SAMPLES
 from tcpipe.terrain.layers import PAPER_CLASSES
 from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, parse_crs
 from tcpipe.terrain.tiles import find_map_projection
-
-logger = logging.getLogger("tcpipe")
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,5 @@
 """Writing a dataset from chosen inputs: sample, split, audit, describe; card and page last."""
 
-import logging
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -28,10 +27,9 @@ from tcpipe.pipeline.dataset.content import SampleTable, gather_content, write_p
 from tcpipe.pipeline.dataset.inputs import ChosenInputs
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.without_coordinates import make_publication
+from tcpipe.progress import logger
 from tcpipe.report.dataset_report import SAMPLE_COLUMNS, render_dataset_report
 from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
-
-logger = logging.getLogger("tcpipe")
 
 
 def write_dataset(directory: Path, inputs: ChosenInputs, options: BuildOptions, jobs: int) -> DatasetCard:
