@@ -33,13 +33,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression, nnls
 from scipy.special import ndtr, ndtri, stdtrit
 
 from tcpipe.arrays import AnyInts, Floats, Ints, Mask, NamedArrays
 
-Classes = NDArray[np.integer]
 Stated = Floats | float | None
 Near = Mask | None
 Residuals = NamedArrays
@@ -142,7 +140,7 @@ class QuantityErrors:
     near: QuantityErrors | None = None
     """Errors near training ground, the outer ones being for other ground; None with too few such held-out samples."""
 
-    def compute_std(self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None) -> Floats:
+    def compute_std(self, predicted: Floats, class_id: AnyInts, stated: Stated = None, is_near: Near = None) -> Floats:
         """Return the standard deviation of each prediction, shape (N,).
 
         ``stated``: the model's standard deviation, None: as usual; ``is_near``: near training ground, shape (N,), None:
@@ -155,7 +153,7 @@ class QuantityErrors:
         return np.where(is_near, self.near.compute_std(predicted, class_id, stated), std)
 
     def compute_intervals(
-        self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None
+        self, predicted: Floats, class_id: AnyInts, stated: Stated = None, is_near: Near = None
     ) -> tuple[Floats, Floats]:
         """Return the interval of each path segment, shape (N,) each."""
         spread, near = self.compute_std(predicted, class_id, stated, is_near), self.near or self
@@ -164,7 +162,7 @@ class QuantityErrors:
         return predicted + low * spread, predicted + high * spread
 
     def compute_sum(
-        self, predicted: Floats, class_id: Classes, stated: Stated = None, is_near: Near = None
+        self, predicted: Floats, class_id: AnyInts, stated: Stated = None, is_near: Near = None
     ) -> SumDistribution:
         """Return the distribution of a path's sum over segments of about 1 m in order; shape (N,), NaN counts as 0."""
         known = np.isfinite(predicted)

@@ -33,7 +33,7 @@ from tcpipe.tables.findings import Findings, Subject, make_finding, read_thresho
 LOG_TIME = "log_time_ns"
 GNSS, GNSS_VELOCITY = Subject("role", "gnss"), Subject("role", "gnss_velocity")
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
-_Arrays = dict[str, AnyArray]
+Arrays = dict[str, AnyArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Readings:
     row: Ints
     log_time_ns: Ints
     header_ns: Ints | None
-    columns: _Arrays
+    columns: Arrays
     dropped: dict[str, int] = field(default_factory=dict)
     notes: dict[str, int] = field(default_factory=dict)
     findings: Findings = ()
@@ -119,7 +119,7 @@ def read_header_ns(columns: Columns) -> Ints | None:
     return columns[_STAMP[0]].astype(np.int64) * 1_000_000_000 + columns[_STAMP[1]].astype(np.int64)
 
 
-def _select_rows(columns: Columns, values: _Arrays, drops: Mapping[str, Mask], **extra: Any) -> Readings:
+def _select_rows(columns: Columns, values: Arrays, drops: Mapping[str, Mask], **extra: Any) -> Readings:
     """Return the readings of the rows that no reason drops; a row counts under its first reason."""
     keep = np.ones(len(columns[LOG_TIME]), bool)
     dropped: dict[str, int] = {}
@@ -145,7 +145,7 @@ def _read_vector(columns: Columns, prefix: str) -> Floats:
     return np.stack([columns[f"{prefix}.{axis}"].astype(float) for axis in "xyz"], -1)
 
 
-def _name_axes(name: str, suffix: str, values: Floats) -> _Arrays:
+def _name_axes(name: str, suffix: str, values: Floats) -> Arrays:
     return {f"{name}_{axis}_{suffix}": values[:, i] for i, axis in enumerate("xyz")}
 
 
@@ -201,7 +201,7 @@ def _is_outside(lat_deg: Floats, lon_deg: Floats) -> Mask:
     return (np.abs(lat_deg) > 90) | (np.abs(lon_deg) > 180)
 
 
-def _read_gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, quality: Floats) -> _Arrays:
+def _read_gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, quality: Floats) -> Arrays:
     return {
         "lon_deg": lon,
         "lat_deg": lat,
@@ -293,7 +293,7 @@ def find_utc_offset(readings: Readings) -> Findings:
     return (make_finding("utc-differs-from-header", GNSS, offset_s=apart_s, remedies=remedies),)
 
 
-def _make_ground_velocity(velocity: Floats, variances: Floats, status: AnyArray | int = -1) -> _Arrays:
+def _make_ground_velocity(velocity: Floats, variances: Floats, status: AnyArray | int = -1) -> Arrays:
     """Return the columns of velocities east, north, up (N, 3) and their variances."""
     axes = ("east", "north", "up")
     return {
@@ -434,7 +434,7 @@ def _read_imu(columns: Columns) -> Readings:
 _POSE = ("x_m", "y_m", "z_m", "quat_x", "quat_y", "quat_z", "quat_w")
 
 
-def _read_body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[_Arrays, Floats]:
+def _read_body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[Arrays, Floats]:
     """Return a twist's columns, null where it is not measured, and the twist as published, shape (N, 6)."""
     linear, angular = _read_vector(columns, f"{prefix}.linear"), _read_vector(columns, f"{prefix}.angular")
     twist = np.concatenate((linear, angular), -1)
@@ -477,7 +477,7 @@ def _read_twist_stamped(columns: Columns) -> Readings:
 def _read_command(columns: Columns) -> Readings:
     prefix = "twist." if "twist.linear.x" in columns else ""
     forward, yaw_rate = (columns[f"{prefix}{name}"].astype(float) for name in ("linear.x", "angular.z"))
-    values: _Arrays = {"forward_velocity_mps": forward, "yaw_rate_radps": yaw_rate}
+    values: Arrays = {"forward_velocity_mps": forward, "yaw_rate_radps": yaw_rate}
     return _select_rows(columns, values, {"not_finite": ~np.isfinite(forward + yaw_rate)})
 
 
@@ -489,7 +489,7 @@ def _read_pose(columns: Columns) -> Readings:
         quat[:] = np.nan
     if np.all(place[:, 2] == place[:1, 2]):  # a map in the plane
         variances[:, 2] = NO_HEIGHT_M2
-    values: _Arrays = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
+    values: Arrays = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
     values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), np.full(len(place), np.nan))
     values |= {f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))}
     values |= {f"quat_{c}": quat[:, i] for i, c in enumerate("xyzw")}

@@ -23,6 +23,7 @@ from tcpipe.formats.parquet import read_table
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
+from tcpipe.splits.audit import PLACES
 from tcpipe.store import find_named_run
 from tcpipe.tables.bits import DropReason, Quality, flag_names
 from tcpipe.tables.columns import make_text_column, to_numbers, to_texts
@@ -228,12 +229,9 @@ def _make_line(lonlat: Sequence[Sequence[float]], colour: str, properties: Mappi
 
 def _iterate_segment_lines(segments: pa.Table) -> Iterator[dict[str, Any]]:
     """Yield a GeoJSON line a segment, with its labels and quality."""
-    for row in segments.select(["segment_id", *_ENDS, *_LABELS, "quality_names"]).to_pylist():
-        lonlat = [row.pop(name) for name in _ENDS]
+    for row in segments.select(["segment_id", *PLACES, *_LABELS, "quality_names"]).to_pylist():
+        lonlat = [row.pop(name) for name in PLACES]
         yield _make_line([lonlat[:2], lonlat[2:]], _SEGMENT_COLOUR, {"name": row["segment_id"], **row})
-
-
-_ENDS = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
 
 
 def _iterate_dropped_lines(rows: pa.Table) -> Iterator[dict[str, Any]]:

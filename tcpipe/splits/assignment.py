@@ -17,11 +17,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, Floats, Mask
+from tcpipe.arrays import Bytes, Floats, Mask, Texts
 from tcpipe.splits.regions import Regions, classify_footprints
 
 Ints = NDArray[np.signedinteger]
-Names = NDArray[np.str_]
 Ranks = NDArray[np.uint64]
 Holdout = Literal["block", "sample", "run", "tag"]
 
@@ -158,9 +157,9 @@ class Assignment:
     fold: NDArray[np.int8]
 
     @property
-    def split(self) -> Names:
+    def split(self) -> Texts:
         """The split of every sample by its name: one of `SPLITS` or `EXCLUDED`."""
-        names: Names = _NAMES[self.code]
+        names: Texts = _NAMES[self.code]
         return names
 
     def is_in(self, *splits: str) -> Mask:

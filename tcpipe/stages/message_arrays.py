@@ -13,14 +13,13 @@ from tcpipe.arrays import AnyArray, Floats, Ints, Texts
 from tcpipe.fusion.measurements import GNSS, POSE
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.logs.extrinsics import Transforms
-from tcpipe.logs.messages import LOG_TIME
+from tcpipe.logs.messages import LOG_TIME, Arrays
 from tcpipe.logs.topics import Topic
 from tcpipe.power.rails import Rail, make_rail, make_samples
 from tcpipe.tables.columns import Tables, select_rows, to_floats, to_integers, to_numbers, to_texts
 from tcpipe.tables.levels import STREAMS, Streams
 
 T = TypeVar("T", bound=np.generic)
-Arrays = dict[str, AnyArray]
 
 
 class LogReader(Protocol):

@@ -10,13 +10,14 @@ import pyarrow as pa
 from tcpipe.errors import RoleError
 from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, RECIPE, AlignedClocks, TopicTimeline, TopicTimes, settle_clocks
 from tcpipe.logs.field_mapping import find_topic
+from tcpipe.logs.messages import Arrays
 from tcpipe.logs.roles import MOTION_ROLES, RoleAssignment, assign_roles
 from tcpipe.logs.topics import Topic, find_missing_roles
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.robots import Profiles
-from tcpipe.stages.message_arrays import Arrays, LogReader, gather_messages
+from tcpipe.stages.message_arrays import LogReader, gather_messages
 from tcpipe.stages.proposals import find_proposals
 from tcpipe.stages.read_power import (
     add_averaging,

@@ -20,6 +20,7 @@ from tcpipe.logs.extrinsics import IDENTITY, Pose, Tree, build_static_tree, find
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_mapped_message
 from tcpipe.logs.messages import (
     LOG_TIME,
+    Arrays,
     Readings,
     count_frames,
     find_utc_offset,
@@ -32,7 +33,7 @@ from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig, Role
 from tcpipe.recipe.suggestions import make_place_to_measure, suggest
 from tcpipe.robots import Profiles
-from tcpipe.stages.message_arrays import Arrays, LogReader, read_transforms
+from tcpipe.stages.message_arrays import LogReader, read_transforms
 from tcpipe.stages.read_power import list_second_meters, read_power_of_topics, select_power_rows
 from tcpipe.tables.columns import Tables, to_floats
 from tcpipe.tables.findings import Finding, Findings, Subject, make_finding
