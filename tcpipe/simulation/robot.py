@@ -198,7 +198,7 @@ def _evaluate_at_contact(world: World, robot: SimulatedRobot, x: Floats, y: Floa
     if robot.wheels is None or world.surface is None:
         return np.asarray(usual)
     half = robot.wheels.contact_m / 2.0
-    u, v = x - world.site.west_m, y - world.site.south_m
+    u, v = world.site.uv_m(x, y)
     higher, lower = (world.surface.relief_m(classes, u + at * cos, v + at * sin) for at in (half, -half))
     return np.asarray(usual + 0.5 * robot.wheels.bump_loss * np.abs(higher - lower) / robot.wheels.contact_m)
 

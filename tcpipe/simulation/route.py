@@ -116,7 +116,7 @@ def _integrate(values: Floats) -> Floats:
 def _compute_curvature(corners: Floats, radius_m: float) -> tuple[Floats, float]:
     """Return the smoothed curvature every PATH_GRID_M, run-out included, and the length up to the last corner."""
     steps = np.diff(corners, axis=0)
-    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    lengths = np.hypot(*steps.T)
     turns = (np.diff(np.arctan2(steps[:, 1], steps[:, 0])) + np.pi) % (2.0 * np.pi) - np.pi
     cuts = np.zeros(lengths.size + 1)
     for i, turn in enumerate(turns):
@@ -421,7 +421,7 @@ def _make_truth(
         command_velocity_mps=driven.command_mps, command_yaw_rate_radps=driven.command_radps,
         voltage_volt=voltage, current_amp=current, right_share=right_share, power_watt=voltage * current,
         energy_joule=np.concatenate([[0.0], np.cumsum(energy_step)]),
-        distance_m=np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]))]),
+        distance_m=np.concatenate([[0.0], np.cumsum(np.hypot(*step.T))]),
     )  # fmt: skip
 
 

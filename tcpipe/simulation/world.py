@@ -59,6 +59,10 @@ class Site:
         )
         return Transformer.from_pipeline(f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad {steps}")
 
+    def uv_m(self, x_map_m: Floats, y_map_m: Floats) -> tuple[Floats, Floats]:
+        """Return map coordinates [m] counted from the south-west corner."""
+        return x_map_m - self.west_m, y_map_m - self.south_m
+
     def lonlat_deg(self, x_map_m: Floats, y_map_m: Floats) -> tuple[Floats, Floats]:
         """Return longitude and latitude [deg] of map coordinates [m]."""
         lon, lat = self._to_wgs84.transform(x_map_m, y_map_m)
@@ -122,7 +126,7 @@ def draw_waves(
 
 def sum_waves(waves: Sequence[Wave], u: Floats, v: Floats) -> Floats:
     """Sum the waves; sin(a + b) is expanded, so that row and column vectors meet in outer products only."""
-    total = np.zeros(np.broadcast_shapes(np.shape(u), np.shape(v)))
+    total = np.zeros(np.broadcast(u, v).shape)
     for wave in waves:
         k = 2.0 * np.pi / wave.wavelength_m
         a = k * np.cos(wave.direction_rad) * u + wave.phase_rad
@@ -138,7 +142,7 @@ def evaluate_field(waves: Sequence[Wave], u: Floats, v: Floats) -> Floats:
         a = 2.0 * np.pi / length * np.cos(direction) * u.T + phase
         b = 2.0 * np.pi / length * np.sin(direction) * v
         return np.asarray((amplitude * np.cos(b)) @ np.sin(a).T + (amplitude * np.sin(b)) @ np.cos(a).T)
-    total = np.zeros(np.broadcast_shapes(np.shape(u), np.shape(v)))
+    total = np.zeros(np.broadcast(u, v).shape)
     for wave in waves:
         k = 2.0 * np.pi / wave.wavelength_m
         total += wave.amplitude * np.sin(
@@ -305,8 +309,8 @@ class World:
 
     def height_m(self, x_map_m: Floats, y_map_m: Floats) -> Floats:
         """Return the height above the geoid [m]."""
-        u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
-        total = np.full(np.broadcast_shapes(np.shape(u), np.shape(v)), self.base_m)
+        u, v = self.site.uv_m(x_map_m, y_map_m)
+        total = np.full(np.broadcast(u, v).shape, self.base_m)
         for hill in self.hills:
             total += hill.rise_m(u, v)
         return total + sum_waves(self.waves, u, v)
@@ -316,15 +320,15 @@ class World:
         height = self.height_m(x_map_m, y_map_m)
         if self.surface is None:
             return height
-        u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
+        u, v = self.site.uv_m(x_map_m, y_map_m)
         classes = self.terrain_class(x_map_m, y_map_m)
         noise_m = self.surface.map_noise_std_m * evaluate_field(self.surface.noise, u, v)
         return height + self.surface.relief_m(classes, u, v) + noise_m
 
     def gradient(self, x_map_m: Floats, y_map_m: Floats) -> tuple[Floats, Floats]:
         """Return the rise per map metre along the map's x and y."""
-        u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
-        gx, gy = np.zeros(np.broadcast_shapes(np.shape(u), np.shape(v))), np.zeros(())
+        u, v = self.site.uv_m(x_map_m, y_map_m)
+        gx, gy = np.zeros(np.broadcast(u, v).shape), np.zeros(())
         for hill in self.hills:
             bump = hill.rise_m(u, v)
             gx = gx - bump * (u - hill.x_m) / hill.x_sigma_m**2
@@ -338,16 +342,16 @@ class World:
 
     def terrain_class(self, x_map_m: Floats, y_map_m: Floats) -> Bytes:
         """Return the class id, everywhere (the holes of the rasters do not matter here)."""
-        u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
-        classes = np.full(np.broadcast_shapes(np.shape(u), np.shape(v)), GRASS, dtype=np.uint8)
+        u, v = self.site.uv_m(x_map_m, y_map_m)
+        classes = np.full(np.broadcast(u, v).shape, GRASS, dtype=np.uint8)
         for region in self._near(self.regions, u, v):
             classes[region.depth_m(u, v) > 0.0] = region.class_id
         return classes
 
     def ortho(self, x_map_m: Floats, y_map_m: Floats) -> Floats:
         """Return red, green, blue in 0 … 255, last axis; classes blend over 0.3 m at their borders."""
-        u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
-        rgb = np.broadcast_to(_COLOUR[GRASS], (*np.broadcast_shapes(np.shape(u), np.shape(v)), 3)).copy()
+        u, v = self.site.uv_m(x_map_m, y_map_m)
+        rgb = np.broadcast_to(_COLOUR[GRASS], (*np.broadcast(u, v).shape, 3)).copy()
         for region in self._near(self.regions, u, v):
             share = np.clip(region.depth_m(u, v) / _SOFT_BORDER_M + 0.5, 0.0, 1.0)
             share = (share * share * (3.0 - 2.0 * share))[..., None]
@@ -363,7 +367,7 @@ class World:
 
     def mapped(self, x_map_m: Floats, y_map_m: Floats) -> Mask:
         """Return whether the rasters hold data here."""
-        u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
+        u, v = self.site.uv_m(x_map_m, y_map_m)
         inside = (u >= 0) & (u <= self.site.width_m) & (v >= 0) & (v <= self.site.height_m)
         for hole in self._near(self.holes, u, v):
             inside = inside & (hole.depth_m(u, v) <= 0.0)
@@ -371,7 +375,7 @@ class World:
 
     def resistance_factor(self, x_map_m: Floats, y_map_m: Floats) -> Floats:
         """Return the factor on the class's rolling resistance: a part that the orthophoto shows, and a hidden part."""
-        u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
+        u, v = self.site.uv_m(x_map_m, y_map_m)
         hidden = sum_waves(self.resistance, u, v)
         if self.surface is None:
             return 1.0 + hidden
