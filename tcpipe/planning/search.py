@@ -397,7 +397,9 @@ def straighten_path(steps: GridSteps, points_px: Floats) -> Floats:
     points = np.clip(points_px, -0.5, limit)
     for _ in range(_PASSES):
         so_far, before = np.empty(len(points)), np.zeros(len(points), np.int64)
-        find_best_lines(steps, angles, metres, points, _choose_window(points), so_far, before)
+        each = max(float(np.linalg.norm(np.diff(points, axis=0), axis=1).mean()), 1.0) * SAMPLES_A_CELL / 2.0
+        window = int(np.clip(np.sqrt(_MOST_SAMPLES / (len(points) * each)), 2, len(points)))  # it bounds the work
+        find_best_lines(steps, angles, metres, points, window, so_far, before)
         kept = [len(points) - 1]
         while kept[-1]:
             kept.append(int(before[kept[-1]]))
@@ -406,10 +408,3 @@ def straighten_path(steps: GridSteps, points_px: Floats) -> Floats:
         if unchanged:
             break
     return points
-
-
-def _choose_window(points: Floats) -> int:
-    """Return how many points earlier a line may begin, which bounds the work."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    each = max(float(steps.mean()), 1.0) * SAMPLES_A_CELL / 2.0
-    return int(np.clip(np.sqrt(_MOST_SAMPLES / (len(points) * each)), 2, len(points)))
