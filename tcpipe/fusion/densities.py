@@ -122,7 +122,7 @@ _CODE_PHASE_M2 = 1.5**2  # variance of each axis [m²]; GPS Standard Positioning
 _PROCESS_STD = 0.6  # 1σ of the share of the claim [1] that one correlation time has
 _AXES_STD = 0.25  # 1σ of the difference of processes in the plane and of heights [1], by their total
 _MAX_PRIOR_GROWTH = 25.0  # largest factor [1] by which a prior's standard deviation grows with the density
-_SLOPE_RAD = 0.1  # slope of unknown ground [rad], 1σ
+_CLAIM_LASTS_S = 0.05  # correlation time of the error that an odometry claims [s]
 _ROUNDING = 1e-10  # variance of rounding [m²]
 
 
@@ -362,11 +362,14 @@ def make_prior_model(measurements: Measurements) -> NoiseModel:
     """Return the noise by priors and claims alone."""
     gnss, imu = measurements.gnss, [IMU] if measurements.imu is not None else []
     return NoiseModel(
-        horizontal=None if gnss is None else _make_fix_prior(gnss, slice(0, 2), _compute_sway_m2(measurements, gnss)),
+        horizontal=None if gnss is None else _make_fix_prior(gnss, slice(0, 2)),
         vertical=None if gnss is None else _make_fix_prior(gnss, slice(2, 3)),
         odometries={
             role: SensorNoise(
-                _compute_density(each.stamp_ns, each.velocity_mps[:, 0]) + PRIORS[f"{role} velocity"].variance,
+                max(
+                    _compute_density(each.stamp_ns, each.velocity_mps[:, 0]) + PRIORS[f"{role} velocity"].variance,
+                    _CLAIM_LASTS_S * float(np.median(each.variance_m2ps2[:, 0])),
+                ),
                 PRIORS[f"{role} scale"],
             )
             for role, each in measurements.odometries().items()
@@ -382,22 +385,13 @@ def make_prior_model(measurements: Measurements) -> NoiseModel:
     )
 
 
-def _compute_sway_m2(m: Measurements, gnss: Positions) -> float:
-    """Return the variance of the antenna's place [m²] as its height moves it sideways on slopes that nothing measures."""
-    if m.has_absolute_tilt:
-        return 0.0
-    height_m2 = gnss.lever_arm_std_m[2] ** 2 + (m.is_antenna_alone or not gnss.has_heights) * gnss.lever_arm_m[2] ** 2
-    return _SLOPE_RAD**2 * height_m2
-
-
-def _make_fix_prior(gnss: Positions, axes: slice, sway_m2: float = 0.0) -> SensorNoise:
-    """Return the noise of fixes whose claims are right in total, and of an antenna that sways."""
+def _make_fix_prior(gnss: Positions, axes: slice) -> SensorNoise:
+    """Return the noise of fixes whose claims are right in total."""
     claimed = float(np.median(gnss.variance_m2[:, axes]))
     if claimed >= NO_TRUST:  # not measured: there is no error that lasts, which would be kilometres
         return SensorNoise(claimed, _NO_PROCESS, claimed)
     prior = PRIORS["fix, centimetres" if claimed < _CENTIMETRES_M2 else "fix, more"]
-    lasting = GaussMarkov(prior.variance * claimed + sway_m2, prior.time_s)
-    return SensorNoise((1.0 - prior.variance) * claimed, lasting, claimed)
+    return SensorNoise((1.0 - prior.variance) * claimed, GaussMarkov(prior.variance * claimed, prior.time_s), claimed)
 
 
 def _compute_density(stamp_ns: NDArray[np.int64], values: Floats) -> float:

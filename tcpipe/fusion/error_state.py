@@ -42,6 +42,7 @@ from tcpipe.fusion.measurements import (
     IMU,
     NO_LEVER_ARM,
     NO_TRUST,
+    STATED_ARM_STD_M,
     UNSTATED_ARM_STD_M,
     WHEELS,
     InitialState,
@@ -50,7 +51,7 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, find_walk, make_model, make_priors, make_start, widen_start
-from tcpipe.fusion.process import find_best_scale_std, is_length_observable
+from tcpipe.fusion.process import GROUND, SLOPE_RAD, UNSEEN_TURN_RADPS, find_best_scale_std, is_length_observable
 from tcpipe.fusion.smoother_kernel import LARGEST_EVENT, SELDOM, Candidates, Smoothed, make_adjoint, smooth_ticks
 from tcpipe.fusion.state import Error, Kind
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
@@ -352,6 +353,11 @@ def make_trajectory(
     links = _interpolate_links(smoothed, at, output_ns)
     if m.gnss is not None and not m.gnss.has_heights:
         position_variance[:, 2] += NO_TRUST
+    if m.gnss is not None and not m.has_absolute_tilt:
+        # On slopes that nothing measures an antenna of unknown height moves sideways.
+        height_m2 = max(0.0, m.gnss.lever_arm_std_m[2] ** 2 - STATED_ARM_STD_M[2] ** 2)
+        height_m2 += m.is_antenna_alone * m.gnss.lever_arm_m[2] ** 2
+        links += np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2.0 * SLOPE_RAD**2) * height_m2
     if m.gnss is not None and m.is_antenna_alone:  # level, and along the course
         antenna = np.asarray(m.gnss.lever_arm_m)
         yaw = compute_course(velocity)
@@ -361,11 +367,12 @@ def make_trajectory(
         yaw_variance = (np.pi / np.sqrt(3.0)) ** 2 * speed_variance / (speed_variance + speed**2)
         position -= rotation @ antenna
         position_variance[:, :2] += (yaw_variance * np.sum(antenna[:2] ** 2))[:, None]
+        speed_variance += (UNSEEN_TURN_RADPS * antenna[2]) ** 2
     is_open = m.odometries() and not is_length_observable(m, noise.horizontal)
     scale_std = find_best_scale_std(m) if is_open else 0.0
     if m.gnss is None:
         position_variance += (scale_std * (position - position[0])) ** 2
-    links = links + (scale_std * speed[:, None] * DISPLACEMENT_LAGS_S) ** 2
+    links += (scale_std * speed[:, None] * DISPLACEMENT_LAGS_S) ** 2
     return Trajectory(
         stamp_ns=output_ns,
         position_enu_m=position,

@@ -264,11 +264,15 @@ class _Alignment:
         self._attitude = attitude
         self._arm_m = attitude.rotation @ np.asarray(gnss.lever_arm_m)
         time_s, end_s = compute_seconds(gnss.stamp_ns, zero_ns), float(attitude.time_s[-1])
-        window_s = min(10.0, 0.25 * end_s)  # of the alignment [s]
-        apart = max(1, round(0.2 * window_s * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
-        first = np.arange(0, time_s.size, apart)
-        last = np.minimum(np.searchsorted(time_s, time_s[first] + window_s), time_s.size - 1)
-        near = np.abs(time_s[last] - time_s[first] - window_s) < 0.3 * window_s
+        std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
+        for share in (1.0, 0.5, 0.25, 0.125):  # gaps of fixes leave more windows where these are shorter
+            window_s = share * min(10.0, 0.25 * end_s)
+            apart = max(1, round(0.2 * window_s * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
+            first = np.arange(0, time_s.size, apart)
+            last = np.minimum(np.searchsorted(time_s, time_s[first] + window_s), time_s.size - 1)
+            near = np.abs(time_s[last] - time_s[first] - window_s) < 0.3 * window_s
+            if near.sum() >= 3 * _FEWEST or window_s < 40.0 * std_m:  # half of it shows no heading at 0.5 m/s
+                break
         first, last = first[near], last[near]
         self._start_s, self._end_s = time_s[first], time_s[last]
         self._moved_m = gnss.position_enu_m[last] - gnss.position_enu_m[first]

@@ -17,7 +17,7 @@ from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory
 from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements, Positions
-from tcpipe.fusion.process import find_scale_stds, is_length_observable, turn_scale_std
+from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, is_length_observable, turn_scale_std
 from tcpipe.fusion.state import Error, Kind, Mode
 from tcpipe.fusion.ticks import Ticks
 from tcpipe.geometry.rotation import matrix_from_quat
@@ -125,11 +125,14 @@ def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> 
     """Return the standard deviation of what fixes err throughout the section [m], shape (3,).
 
     That is what fixes claim beyond the errors that the section shows; without tilt also the antenna's place, since an
-    antenna that sways looks like one elsewhere.
+    antenna that sways looks like one elsewhere, and without heights, which show slopes, the sway.
     """
     axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
     variance = np.array([max(0.0, fix.claimed_m2 - fix.white - fix.correlated.variance) for fix in axes])
-    return np.asarray(np.sqrt(variance + np.where(_find_arm_axes(m), 0.0, np.square(gnss.lever_arm_std_m))))
+    variance += np.where(_find_arm_axes(m), 0.0, np.square(gnss.lever_arm_std_m))
+    if not m.has_tilt and (m.is_antenna_alone or not gnss.has_heights):
+        variance[:2] += (SLOPE_RAD * gnss.lever_arm_m[2]) ** 2
+    return np.asarray(np.sqrt(variance))
 
 
 def _find_arm_axes(m: Measurements) -> tuple[bool, bool, bool]:

@@ -14,14 +14,7 @@ from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.densities import PRIORS, NoiseModel, SensorNoise
-from tcpipe.fusion.measurements import (
-    IMU,
-    VISUAL,
-    WHEELS,
-    BodyVelocities,
-    Measurements,
-    Positions,
-)
+from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
 from tcpipe.fusion.signals import (
     MAX_ACCELERATION_MPS2,
     compute_median_period_ns,
@@ -43,6 +36,7 @@ _TURN_SCALE_STD: Mapping[str, float] = {
     VISUAL: 0.03,  # camera
 }
 """σ of the scale of a turn rate [1]."""
+SLOPE_RAD = 0.1  # slope of unknown ground [rad], 1σ
 UNSEEN_TURN_RADPS = 0.07  # roll and pitch rate on uneven ground [rad/s], 1σ
 GROUND = 2e-3  # density of the change of slope under a robot [rad²/m]: 2.6° over a metre
 _ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration [s]: one row

@@ -23,10 +23,7 @@ from tcpipe.fusion.densities import PRIORS, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory, Tests, TickInputs
 from tcpipe.fusion.level_motion import COURSE, get_turn_rates
 from tcpipe.fusion.measurements import IMU, NO_TRUST, VISUAL, WHEELS, BodyVelocities, Measurements
-from tcpipe.fusion.process import (
-    UNSEEN_TURN_RADPS,
-    make_motion_noise,
-)
+from tcpipe.fusion.process import UNSEEN_TURN_RADPS, make_motion_noise
 from tcpipe.fusion.signals import (
     compute_interval_means,
     compute_median_period_ns,

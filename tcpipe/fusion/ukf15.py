@@ -20,13 +20,7 @@ from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion import state
 from tcpipe.fusion.changes import Hypothesis
 from tcpipe.fusion.error_state import make_tests, make_trajectory, prepare_section
-from tcpipe.fusion.filter_kernel import (
-    RESET_REJECTIONS,
-    RESET_SPEED_STD_MPS,
-    FilterModel,
-    GateVerdict,
-    Memory,
-)
+from tcpipe.fusion.filter_kernel import RESET_REJECTIONS, RESET_SPEED_STD_MPS, FilterModel, GateVerdict, Memory
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S, InitialState, Measurements, Trajectory
 from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed
 from tcpipe.fusion.state import Error, Kind

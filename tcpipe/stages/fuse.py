@@ -23,11 +23,7 @@ from tcpipe.stages.fuse_findings import (
     make_fuse_facts,
     rename_role,
 )
-from tcpipe.stages.fuse_inputs import (
-    Section,
-    drop_implausible_sensors,
-    prepare_sections,
-)
+from tcpipe.stages.fuse_inputs import Section, drop_implausible_sensors, prepare_sections
 from tcpipe.stages.fuse_sections import Fused, find_exclusions, fuse_section, make_rejections_table, merge_findings
 from tcpipe.stages.message_arrays import find_fixes_role, use_pose_as_fixes
 from tcpipe.tables.facts import SensorChecks

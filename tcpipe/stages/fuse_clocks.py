@@ -8,11 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.fusion.checks.clock_offsets import (
-    find_clock_offsets,
-    find_other_clocks,
-    shift_sensors,
-)
+from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, find_other_clocks, shift_sensors
 from tcpipe.fusion.checks.sanity import SensorExclusion
 from tcpipe.fusion.course import MIN_SPEED_MPS
 from tcpipe.fusion.measurements import DOPPLER, GNSS
@@ -22,13 +18,7 @@ from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_findings import rename_role
-from tcpipe.stages.fuse_inputs import (
-    Section,
-    exclude_sensors,
-    find_span_s,
-    prepare_sections,
-    rank_sections,
-)
+from tcpipe.stages.fuse_inputs import Section, exclude_sensors, find_span_s, prepare_sections, rank_sections
 from tcpipe.stages.fuse_sections import merge_findings
 from tcpipe.stages.message_arrays import find_fixes_role, use_pose_as_fixes
 from tcpipe.tables.facts import ClockFacts, ClockOffset

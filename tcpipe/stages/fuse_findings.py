@@ -21,13 +21,7 @@ from tcpipe.geometry.rotation import (
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robust import MIN_SIGMAS
 from tcpipe.stages.fuse_inputs import Section, exclude_role, state_extrinsics
-from tcpipe.tables.facts import (
-    ChangeFacts,
-    FuseFacts,
-    GateReset,
-    ParameterFacts,
-    StretchFacts,
-)
+from tcpipe.tables.facts import ChangeFacts, FuseFacts, GateReset, ParameterFacts, StretchFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
 

@@ -15,13 +15,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion import preparation
 from tcpipe.fusion.attitude import align_mounting
 from tcpipe.fusion.checks.motions import compute_driven_m, find_span_ns
-from tcpipe.fusion.checks.sanity import (
-    CONSTANT_FAULTS,
-    Command,
-    SensorExclusion,
-    check_ground_velocity,
-    check_sensors,
-)
+from tcpipe.fusion.checks.sanity import CONSTANT_FAULTS, Command, SensorExclusion, check_ground_velocity, check_sensors
 from tcpipe.fusion.measurements import (
     DOPPLER,
     GNSS,

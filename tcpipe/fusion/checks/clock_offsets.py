@@ -42,15 +42,7 @@ from tcpipe.fusion.checks.motions import (
     resample_imu,
     resample_twist,
 )
-from tcpipe.fusion.measurements import (
-    DOPPLER,
-    GNSS,
-    IMU,
-    VISUAL,
-    WHEELS,
-    Measurements,
-    select_measurements,
-)
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements, select_measurements
 from tcpipe.fusion.signals import Plane, Signal, compute_moving_mean, compute_seconds
 from tcpipe.robust import MIN_SIGMAS
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair

@@ -32,16 +32,7 @@ from tcpipe.fusion.checks.motions import (
     resample_signal,
     resample_twist,
 )
-from tcpipe.fusion.measurements import (
-    DOPPLER,
-    GNSS,
-    IMU,
-    PAUSE_NS,
-    VISUAL,
-    WHEELS,
-    Measurements,
-    Positions,
-)
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, PAUSE_NS, VISUAL, WHEELS, Measurements, Positions
 from tcpipe.fusion.preparation import GRAVITY_BAND_MPS2
 from tcpipe.fusion.signals import Plane, hold_last
 from tcpipe.fusion.state import GRAVITY_MPS2

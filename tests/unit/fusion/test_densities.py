@@ -131,6 +131,19 @@ def test_short_sections_keep_the_larger_of_fit_and_prior(length_s, short):
     assert compute_change_std(model.horizontal, 40.0) > 0.9 * compute_change_std(prior.horizontal, 40.0)
 
 
+def test_an_odometry_that_nothing_is_compared_with_errs_as_it_claims(short):
+    alone = replace(short, gnss=None, visual=None)
+    claimed = [
+        replace(alone.wheels, variance_m2ps2=np.full_like(alone.wheels.variance_m2ps2, std_mps**2))
+        for std_mps in (0.001, 0.4, 0.8)
+    ]
+    none, some, twice = (
+        drive.estimate_noise(replace(alone, wheels=wheels)).odometries["wheel_odometry"].white for wheels in claimed
+    )
+    assert none < some
+    assert twice == pytest.approx(4.0 * some)
+
+
 def change_fixes(whole, **columns):
     return replace(whole, gnss=replace(whole.gnss, **columns))
 

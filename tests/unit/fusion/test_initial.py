@@ -26,13 +26,26 @@ def start_of(measurements):
         ({"reverse_s": 12.0}, {}),
         ({"stand_s": 0.2, "turns": 2.0}, {}),
         ({}, {"gnss_outages": ((0.0, 25.0),)}),
+        ({}, {"gnss_outages": ((6.0, 16.0), (26.0, 36.0), (42.0, 56.0))}),
         ({}, {"wheels": False}),
         ({}, {"wheels": False, "visual": False}),
         ({}, {"imu": False}),
         ({}, {"gnss_std": 1.0, "gnss_hz": 1.0}),
         ({}, {"gnss_outliers": 0.15}),
     ],
-    ids=["stands", "west", "reverse", "turning", "late gnss", "visual", "gnss imu", "no imu", "sbas", "outliers"],
+    ids=[
+        "stands",
+        "west",
+        "reverse",
+        "turning",
+        "late gnss",
+        "gaps",
+        "visual",
+        "gnss imu",
+        "no imu",
+        "sbas",
+        "outliers",
+    ],
 )
 def test_yaw_tilt_and_position_lie_within_their_deviations(how, faults):
     truth = drive.make_drive(60.0, **how)
