@@ -1,4 +1,4 @@
-"""Types of arrays, by their elements."""
+"""Types of arrays, by their elements, and of bounds."""
 
 from collections.abc import Mapping
 from typing import Any, TypeAlias
@@ -18,3 +18,5 @@ AnyArray: TypeAlias = NDArray[Any]
 NamedArrays: TypeAlias = Mapping[str, AnyArray]
 Columns: TypeAlias = NamedArrays
 """Arrays of one length, by the names of a table's columns."""
+Box: TypeAlias = tuple[float, float, float, float]
+"""Least x and y, greatest x and y."""

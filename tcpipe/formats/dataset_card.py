@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Literal
 
+from tcpipe.arrays import Box
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum, FileChecksums
@@ -14,7 +15,6 @@ from tcpipe.tables.facts import EnergyBudget, Floor, HeldOut, PhysicsFit
 from tcpipe.tables.findings import Finding, Findings, Verdict, judge_by_code, omit
 from tcpipe.tables.levels import LABELS
 from tcpipe.terrain.layers import TerrainClass
-from tcpipe.terrain.projection import Box
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from pyproj import Transformer
 
-from tcpipe.arrays import Bytes, Floats
+from tcpipe.arrays import Box, Bytes, Floats
 from tcpipe.errors import StoreError, TcpipeError, clean_line
 from tcpipe.formats.dataset_card import LOCAL, DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, OVERVIEW, RELIEF
@@ -29,7 +29,6 @@ from tcpipe.report.plots import Plot, lay_picture, make_map_plot, make_plot
 from tcpipe.store import Store
 from tcpipe.tables.columns import read_ends_m, read_lonlat_deg, stack_floats
 from tcpipe.terrain.layers import TerrainClass
-from tcpipe.terrain.projection import Box
 
 Pictures = Mapping[str, str]
 """Pictures of a map by name, as data URIs; the first is visible."""

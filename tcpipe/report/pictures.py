@@ -12,7 +12,7 @@ import pyarrow as pa
 from PIL import Image, ImageColor, UnidentifiedImageError
 from pyproj import Transformer
 
-from tcpipe.arrays import AnyArray, Bytes, Floats, GenericArray, Ints, NamedArrays
+from tcpipe.arrays import AnyArray, Box, Bytes, Floats, GenericArray, Ints, NamedArrays
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import find_places_in_files, open_patches
@@ -21,7 +21,6 @@ from tcpipe.formats.maps.map_files import PICTURE_PX, MapFile
 from tcpipe.report.colours import choose_class_colours
 from tcpipe.tables.columns import to_floats
 from tcpipe.terrain.layers import COLOURS, MAX_ID, ClassTable, Layer, Pixels
-from tcpipe.terrain.projection import Box
 
 ACROSS = 25
 """Patches in one row of a sheet."""

@@ -23,10 +23,10 @@ from bokeh.models import HoverTool
 from bokeh.models.annotations.geometry import Span
 from bokeh.plotting import figure
 
+from tcpipe.arrays import Box
 from tcpipe.errors import clean_line
 from tcpipe.formats.json_files import Json
 from tcpipe.report.colours import CURSOR, DROPPED, KEPT, SPLIT_COLOURS
-from tcpipe.terrain.projection import Box
 
 BOKEH_SCRIPT = Path(bokeh.__file__).parent / "server/static/js/bokeh.min.js"
 """The part of BokehJS that a page needs."""

@@ -14,9 +14,8 @@ import numpy as np
 from pyproj import Transformer
 from scipy.special import erf
 
-from tcpipe.arrays import Bytes, Floats, Mask
+from tcpipe.arrays import Box, Bytes, Floats, Mask
 from tcpipe.tables.findings import omit
-from tcpipe.terrain.projection import Box
 
 _SEMI_MAJOR_M = 6378137.0
 _ECCENTRICITY2 = 0.0066943799901413165

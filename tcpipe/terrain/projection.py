@@ -8,7 +8,6 @@ bound CRS.
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -19,15 +18,13 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import AreaOfInterest as TransformArea
 from pyproj.transformer import TransformerGroup
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Box, Floats
 from tcpipe.errors import MapError
 from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 
 MAX_SCALE_ERROR = 0.01
 """A CRS whose unit is further from a metre of ground than this share is not metric enough to cut patches in."""
 
-Box: TypeAlias = tuple[float, float, float, float]
-"""Least x and y, greatest x and y."""
 _EARTH_RADIUS_M = 6_371_000.0
 
 

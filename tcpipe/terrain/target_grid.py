@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from pyproj import CRS
 
-from tcpipe.arrays import Floats, Mask
+from tcpipe.arrays import Box, Floats, Mask
 from tcpipe.errors import MapError
-from tcpipe.terrain.projection import Box, Projection, compute_area, find_utm_crs, format_crs, is_metric
+from tcpipe.terrain.projection import Projection, compute_area, find_utm_crs, format_crs, is_metric
 
 LATTICE_STEP_PX = 16
 """Spacing of projected pixels, positions between are interpolated: error 1e-7 px for a site, 1e-3 px for a country."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 from xml.etree.ElementTree import Element, fromstring
 
+from tcpipe.arrays import Box
 from tcpipe.formats.json_files import parse_typed, to_plain
 from tcpipe.tables.findings import Findings, omit
 from tcpipe.terrain.layers import (
@@ -20,7 +21,6 @@ from tcpipe.terrain.layers import (
     make_continuous_layer,
     make_paper_layers,
 )
-from tcpipe.terrain.projection import Box
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from tcpipe.arrays import Bytes
+from tcpipe.arrays import Box, Bytes
 from tcpipe.errors import MapError, RegionError
 from tcpipe.formats.geojson import PolygonFeature, read_polygons, shorten_problems, shorten_value
 from tcpipe.formats.maps.geotiff import burn_polygons
@@ -23,7 +23,7 @@ from tcpipe.formats.maps.layer_building import Tally, label_files
 from tcpipe.splits.regions import project_near
 from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 from tcpipe.terrain.layers import ClassScheme, Layer, Pixels, make_paper_layers, name_key
-from tcpipe.terrain.projection import Box, Projection, compute_area
+from tcpipe.terrain.projection import Projection, compute_area
 from tcpipe.terrain.target_grid import MapGrid
 
 PROPERTY = "class"
