@@ -12,9 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.fusion import state
 from tcpipe.fusion.filter_kernel import GateVerdict, Tests
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS
@@ -207,7 +206,7 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
     return value
 
 
-def _find_long_runs(rows: Ints, mask: NDArray[np.bool_], period_s: float, kind: int) -> list[tuple[int, int]]:
+def _find_long_runs(rows: Ints, mask: Mask, period_s: float, kind: int) -> list[tuple[int, int]]:
     """Return runs of true measurements, first and last row, that last longer than a correct sensor is rejected.
 
     The last row is excluded. Fewer than five rows are single outliers.

@@ -10,10 +10,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.level_motion import KNOT_S, get_turn_rates
 from tcpipe.fusion.measurements import IMU, NO_TRUST, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, UP, Residuals
@@ -394,7 +393,7 @@ def _make_fix_prior(gnss: Positions, axes: slice) -> SensorNoise:
     return SensorNoise((1.0 - prior.variance) * claimed, GaussMarkov(prior.variance * claimed, prior.time_s), claimed)
 
 
-def _compute_density(stamp_ns: NDArray[np.int64], values: Floats) -> float:
+def _compute_density(stamp_ns: Ints, values: Floats) -> float:
     """Return the density of white noise [u² s] by the median of the second differences that are not zero."""
     finite = np.isfinite(values)
     second = np.abs(np.diff(values[finite], n=2))

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Mask
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion.state import (
     KINDS,
@@ -76,10 +77,10 @@ class TickInputs(NamedTuple):
     gained: Matrix
     noise: Matrix
     rate: Matrix
-    has_gyro: NDArray[np.bool_]
+    has_gyro: Mask
     acceleration: Vector
-    value: NDArray[np.float64]
-    variance: NDArray[np.float64]
+    value: Floats
+    variance: Floats
     tau: Matrix
     levers: Matrix
     fix_kept: Vector
@@ -135,16 +136,16 @@ class Memory(NamedTuple):
 class Steps(NamedTuple):
     """Inputs of the smoother for B ticks: motion F, kept shares, updates by kind (K, H, S⁻¹ y, S⁻¹, turn), last x, P."""
 
-    F: NDArray[np.float64]
+    F: Floats
     kept: Matrix
-    used: NDArray[np.bool_]
-    K: NDArray[np.float64]
-    H: NDArray[np.float64]
-    pull: NDArray[np.float64]
-    inverse: NDArray[np.float64]
-    turn: NDArray[np.float64]
+    used: Mask
+    K: Floats
+    H: Floats
+    pull: Floats
+    inverse: Floats
+    turn: Floats
     x: Matrix
-    P: NDArray[np.float64]
+    P: Floats
 
 
 class Tests(NamedTuple):

@@ -14,9 +14,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.fusion.course import MIN_SPEED_MPS
 from tcpipe.fusion.level_motion import STEP_S, LevelMotion, OdometryTrack, find_level_motion
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
@@ -164,14 +163,14 @@ def find_stationary_intervals(measurements: Measurements) -> Ints:
     return _find_intervals(stamp, still)
 
 
-def _is_steady(at_ns: Ints, stamp_ns: Ints, values: Floats, largest: float, spread: float) -> NDArray[np.bool_]:
+def _is_steady(at_ns: Ints, stamp_ns: Ints, values: Floats, largest: float, spread: float) -> Mask:
     """Return whether mean and standard deviation of samples (N, k) around each stamp are small."""
     mean, square = (compute_window_means(stamp_ns, each, at_ns, _WINDOW_NS) for each in (values, values**2))
-    small: NDArray[np.bool_] = (np.abs(mean) < largest) & (np.sqrt(np.maximum(square - mean**2, 0.0)) < spread)
+    small: Mask = (np.abs(mean) < largest) & (np.sqrt(np.maximum(square - mean**2, 0.0)) < spread)
     return np.asarray(small.all(axis=1))
 
 
-def _find_intervals(stamp_ns: Ints, still: NDArray[np.bool_]) -> Ints:
+def _find_intervals(stamp_ns: Ints, still: Mask) -> Ints:
     """Return the runs of True, shape (K, 2), without short ones; gaps of half a second end them, and ends are cut."""
     joined = still[1:] & still[:-1] & (np.diff(stamp_ns) < _WINDOW_NS)
     first = np.flatnonzero(still & ~np.concatenate(([False], joined)))

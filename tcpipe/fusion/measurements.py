@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.fusion.signals import compute_median_period_ns, is_in_gap
 from tcpipe.tables.facts import StretchFacts
 
@@ -63,14 +64,14 @@ class Positions:
     lag_std_s : [s], standard deviation of the delay of its stamps: drivers stamp on arrival.
     """
 
-    stamp_ns: NDArray[np.int64]
-    position_enu_m: NDArray[np.float64]
-    variance_m2: NDArray[np.float64]
+    stamp_ns: Ints
+    position_enu_m: Floats
+    variance_m2: Floats
     lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
     lever_arm_std_m: tuple[float, float, float] = STATED_ARM_STD_M
-    unclaimed: NDArray[np.bool_] | None = None
-    quat_xyzw: NDArray[np.float64] | None = None
-    rotation_variance_rad2: NDArray[np.float64] | None = None
+    unclaimed: Mask | None = None
+    quat_xyzw: Floats | None = None
+    rotation_variance_rad2: Floats | None = None
     mounting_xyzw: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
     mounting_std_rad: float = 0.0
     lag_std_s: float = 0.02
@@ -97,9 +98,9 @@ class GroundVelocities:
     variance_m2ps2 : [m²/s²], shape (N, 3); floored, never unknown.
     """
 
-    stamp_ns: NDArray[np.int64]
-    velocity_enu_mps: NDArray[np.float64]
-    variance_m2ps2: NDArray[np.float64]
+    stamp_ns: Ints
+    velocity_enu_mps: Floats
+    variance_m2ps2: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,17 +119,17 @@ class BodyVelocities:
         the source is flat (wheels) or gives none.
     """
 
-    stamp_ns: NDArray[np.int64]
-    velocity_mps: NDArray[np.float64]
-    variance_m2ps2: NDArray[np.float64]
-    yaw_rate_radps: NDArray[np.float64]
+    stamp_ns: Ints
+    velocity_mps: Floats
+    variance_m2ps2: Floats
+    yaw_rate_radps: Floats
     lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
-    turn_rate_radps: NDArray[np.float64] | None = None
+    turn_rate_radps: Floats | None = None
 
     @property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured(self) -> Mask:
         """Axes along which most rows have a velocity, shape (3,)."""
-        is_measured: NDArray[np.bool_] = (self.variance_m2ps2 < 1e3).mean(0) > 0.5  # above: not measured (ruling)
+        is_measured: Mask = (self.variance_m2ps2 < 1e3).mean(0) > 0.5  # above: not measured (ruling)
         return is_measured
 
 
@@ -150,14 +151,14 @@ class InertialMeasurements:
     the same throughout.
     """
 
-    stamp_ns: NDArray[np.int64]
-    angular_velocity_radps: NDArray[np.float64]
-    specific_force_mps2: NDArray[np.float64]
-    quat_xyzw: NDArray[np.float64]
+    stamp_ns: Ints
+    angular_velocity_radps: Floats
+    specific_force_mps2: Floats
+    quat_xyzw: Floats
     gyro_std_radps: float
     accelerometer_std_mps2: float
     accelerometer_usable: bool = True
-    accelerometer_noise_mps2: NDArray[np.float64] | None = None
+    accelerometer_noise_mps2: Floats | None = None
 
 
 Sensor = Positions | GroundVelocities | InertialMeasurements | BodyVelocities
@@ -239,14 +240,14 @@ class InitialState:
     heading_from : how yaw was found: ``course over ground``, ``pose``, ``orientation``, ``local frame`` or ``unknown``.
     """
 
-    position_enu_m: NDArray[np.float64]
-    position_std_m: NDArray[np.float64]
-    quat_xyzw: NDArray[np.float64]
+    position_enu_m: Floats
+    position_std_m: Floats
+    quat_xyzw: Floats
     tilt_std_rad: float
     yaw_std_rad: float
-    velocity_enu_mps: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    velocity_enu_mps: Floats = field(default_factory=lambda: np.zeros(3))
     velocity_std_mps: float = 0.3
-    gyro_bias_radps: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    gyro_bias_radps: Floats = field(default_factory=lambda: np.zeros(3))
     gyro_bias_std_radps: float = 0.02
     heading_from: str = "unknown"
 
@@ -263,7 +264,7 @@ def select_measurements(whole: Measurements, start_ns: int, end_ns: int) -> Meas
     return whole.replace_sensors(found)
 
 
-def select_sensor_rows(source: _Source, rows: slice | NDArray[np.bool_]) -> _Source:
+def select_sensor_rows(source: _Source, rows: slice | Mask) -> _Source:
     """Return a sensor with some of its rows."""
     values = {field.name: getattr(source, field.name) for field in fields(source)}
     chosen: dict[str, Any] = {name: value[rows] for name, value in values.items() if isinstance(value, np.ndarray)}
@@ -295,16 +296,16 @@ class Trajectory:
     facts : what the filter counted and settled on.
     """
 
-    stamp_ns: NDArray[np.int64]
-    position_enu_m: NDArray[np.float64]
-    quat_xyzw: NDArray[np.float64]
-    velocity_enu_mps: NDArray[np.float64]
-    angular_velocity_radps: NDArray[np.float64]
-    position_std_m: NDArray[np.float64]
-    yaw_std_rad: NDArray[np.float64]
-    forward_velocity_std_mps: NDArray[np.float64]
+    stamp_ns: Ints
+    position_enu_m: Floats
+    quat_xyzw: Floats
+    velocity_enu_mps: Floats
+    angular_velocity_radps: Floats
+    position_std_m: Floats
+    yaw_std_rad: Floats
+    forward_velocity_std_mps: Floats
     rejections: Mapping[str, NDArray[Any]]
-    displacement_std_m: NDArray[np.float64]
+    displacement_std_m: Floats
     facts: StretchFacts
 
 
@@ -344,7 +345,7 @@ def cut_sections(measurements: Mapping[int, Measurements], cuts_ns: Sequence[int
     return found
 
 
-def make_track_stamps(section: TrackSection, *, period_ns: int, max_gap_ns: int) -> NDArray[np.int64]:
+def make_track_stamps(section: TrackSection, *, period_ns: int, max_gap_ns: int) -> Ints:
     """Return the multiples of the period inside a section [ns], without those in a gap.
 
     A gap is a time without any of GNSS, wheels and visual odometry longer than ``max_gap_ns`` and than 2.5 times their
@@ -357,6 +358,6 @@ def make_track_stamps(section: TrackSection, *, period_ns: int, max_gap_ns: int)
     return stamp[~is_in_gap(motion, stamp, stamp, longest_ns=longest)]
 
 
-def _make_stamps(measurements: Measurements, *, with_imu: bool) -> NDArray[np.int64]:
+def _make_stamps(measurements: Measurements, *, with_imu: bool) -> Ints:
     stamps = [sensor.stamp_ns for role, sensor in measurements.sensors().items() if with_imu or role != IMU]
     return np.unique(np.concatenate(stamps)) if stamps else np.empty(0, np.int64)

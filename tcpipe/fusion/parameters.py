@@ -16,7 +16,7 @@ from tcpipe.arrays import Floats
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory
-from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements, Positions
+from tcpipe.fusion.measurements import IMU, NO_TRUST, VISUAL, WHEELS, InitialState, Measurements, Positions
 from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, is_length_observable, turn_scale_std
 from tcpipe.fusion.state import Error, Kind, Mode
 from tcpipe.fusion.ticks import Ticks
@@ -60,6 +60,7 @@ PARAMETERS = (
 """Parameters with a prior of their own; that of scales of odometries and errors of fixes is by the run: `make_priors`."""
 FIX_AXES = np.array([1.0, 1.0, 1.7])
 """Ratio of lasting errors of fixes east, north and up [1]: no satellite is below."""
+_UNSEEN_SHARE = 0.25  # of the claimed variance of fixes [1]: errors of hours, by base, antenna and troposphere
 _MINUTE_S = 60.0
 
 
@@ -124,11 +125,12 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
 def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> Floats:
     """Return the standard deviation of what fixes err throughout the section [m], shape (3,).
 
-    That is what fixes claim beyond the errors that the section shows; without tilt also the antenna's place, since an
+    That is what fixes claim beyond the errors that the section shows, or a share of it; without tilt also the antenna's place, since an
     antenna that sways looks like one elsewhere, and without heights, which show slopes, the sway.
     """
     axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
-    variance = np.array([max(0.0, fix.claimed_m2 - fix.white - fix.correlated.variance) for fix in axes])
+    shown, claimed = np.array([(fix.white + fix.correlated.variance, fix.claimed_m2) for fix in axes]).T
+    variance = np.maximum(claimed - shown, _UNSEEN_SHARE * claimed * (claimed < NO_TRUST))
     variance += np.where(_find_arm_axes(m), 0.0, np.square(gnss.lever_arm_std_m))
     if not m.has_tilt and (m.is_antenna_alone or not gnss.has_heights):
         variance[:2] += (SLOPE_RAD * gnss.lever_arm_m[2]) ** 2

@@ -183,7 +183,7 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     acceleration = np.minimum(np.hypot(*axes), MAX_ACCELERATION_MPS2)
     # Between two measurements it changes by 0.07 m/s², 1σ; it lasts for 0.2 s.
     density = np.maximum(max(0.2, period_s) * (0.07**2 + acceleration**2), least)
-    return np.asarray(np.interp(at_ns, source.stamp_ns, density))
+    return np.interp(at_ns, source.stamp_ns, density)
 
 
 def _estimate_slide_density(visual: BodyVelocities | None) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 
 Plane = NDArray[np.complex128]
 Signal = NDArray[Any]
@@ -60,7 +60,7 @@ def interpolate_signal(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
     return np.stack([np.interp(at_s, stamp_s, values[:, k]) for k in range(values.shape[1])], -1)
 
 
-def is_in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) -> NDArray[np.bool_]:
+def is_in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) -> Mask:
     """Return whether each interval touches a span between samples above ``longest_ns``, or is outside the samples.
 
     Half that long outside the first and last sample is still inside.
@@ -72,11 +72,11 @@ def is_in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) 
     long = np.concatenate(([0], np.cumsum(np.diff(stamp_ns) > longest_ns)))  # long gaps before each sample
     before = np.clip(np.searchsorted(stamp_ns, start_ns, "right") - 1, 0, stamp_ns.size - 1)
     after = np.clip(np.searchsorted(stamp_ns, end_ns, "left"), 0, stamp_ns.size - 1)
-    touches: NDArray[np.bool_] = outside | (long[after] > long[before])
+    touches: Mask = outside | (long[after] > long[before])
     return touches
 
 
-def is_covered(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, least_ns: int = 100_000_000) -> NDArray[np.bool_]:
+def is_covered(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, least_ns: int = 100_000_000) -> Mask:
     """Return whether each interval lies among samples without a gap, as `find_longest_step_ns` says."""
     return ~is_in_gap(stamp_ns, start_ns, end_ns, longest_ns=find_longest_step_ns(stamp_ns, least_ns))
 

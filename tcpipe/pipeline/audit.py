@@ -8,10 +8,9 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from scipy.special import betaincinv
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.errors import FusionError, UsageError, clean_lines
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.logs.log_joining import open_single_log
@@ -125,7 +124,7 @@ class TrackRows:
         self._longest_ns = round(1.5e9 / rate_hz)
         """A longer step is a gap."""
 
-    def find(self, stamp_ns: Ints) -> NDArray[np.bool_]:
+    def find(self, stamp_ns: Ints) -> Mask:
         """Return whether there is a track at each stamp, shape (N,)."""
         return ~is_in_gap(self.stamp_ns, stamp_ns, stamp_ns, longest_ns=self._longest_ns)
 

@@ -7,8 +7,8 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS
 from tcpipe.geometry.rotation import (
     matrix_from_quat,
@@ -192,7 +192,7 @@ def _is_contradicted(found: ParameterFacts, least: float) -> bool:
 
 def _find_rotation(
     turned: ParameterFacts | None, inputs: Sequence[Section], part: StretchFacts, sensor: Sensor
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return how the sensor of positions is turned on the robot, shape (3, 3): that of a pose as its run shows it."""
     of_epoch = (each.measurements.gnss for each in inputs if each.clock_epoch == part.clock_epoch)
     fixes = next((each for each in of_epoch if each is not None and each.stamp_ns[-1] >= part.start_ns), None)
@@ -201,7 +201,7 @@ def _find_rotation(
     return matrix_from_quat(multiply(quat_from_rotation_vector(turned.value), fixes.mounting_xyzw))
 
 
-def _find_arm(arm: ParameterFacts, sensor: Sensor, turn: NDArray[np.float64]) -> Finding:
+def _find_arm(arm: ParameterFacts, sensor: Sensor, turn: Floats) -> Finding:
     place = np.asarray(sensor.xyz_m) + arm.value
     axes = ("forward", "left", "up")
     numbers: dict[str, Any] = {f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)}

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats
 from tcpipe.fusion import preparation
 from tcpipe.fusion.attitude import align_mounting
 from tcpipe.fusion.checks.motions import compute_driven_m, find_span_ns
@@ -275,7 +275,7 @@ def exclude_role(name: str) -> tuple[Remedy, ...]:
     return suggest("exclude", {"read.topics": {name: []}})
 
 
-def state_extrinsics(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64]) -> tuple[Remedy, ...]:
+def state_extrinsics(name: str, xyz_m: Sequence[float], turn: Floats) -> tuple[Remedy, ...]:
     """Return what states a sensor's lever arm [m] and its rotation to base_link, shape (3, 3)."""
     place, rpy_rad = (np.round(values, digits) + 0.0 for values, digits in ((xyz_m, 3), (rpy_from_matrix(turn), 4)))
     return suggest(

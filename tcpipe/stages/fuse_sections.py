@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.checks.clock_offsets import NOTED_S
 from tcpipe.fusion.checks.sanity import Command
 from tcpipe.fusion.error_state import run_error_state
@@ -74,9 +74,7 @@ def fuse_section(section: Section, streams: Streams, config: FuseConfig, last: T
     return fused
 
 
-def _estimate(
-    section: TrackSection, initial: InitialState, output_ns: NDArray[np.int64], config: FuseConfig
-) -> Trajectory:
+def _estimate(section: TrackSection, initial: InitialState, output_ns: Ints, config: FuseConfig) -> Trajectory:
     if config.estimator == "ukf":
         from tcpipe.fusion.ukf15 import run_ukf15 as run  # noqa: PLC0415  filterpy takes a second to load
     else:
@@ -98,7 +96,7 @@ def _make_columns(
     }
 
 
-Arrays = dict[str, NDArray[np.float64]]
+Arrays = dict[str, Floats]
 
 
 def make_pose_columns(found: Trajectory, datum_deg_m: tuple[float, float, float] | None) -> Arrays:
@@ -125,9 +123,7 @@ def make_pose_columns(found: Trajectory, datum_deg_m: tuple[float, float, float]
     return columns
 
 
-def make_wheel_column(
-    wheels: BodyVelocities | None, at_ns: NDArray[np.int64], *, max_gap_ns: int
-) -> NDArray[np.float64]:
+def make_wheel_column(wheels: BodyVelocities | None, at_ns: Ints, *, max_gap_ns: int) -> Floats:
     """Return the wheels' forward velocity, interpolated; NaN in gaps."""
     if wheels is None:
         return np.full(at_ns.size, np.nan)
@@ -136,7 +132,7 @@ def make_wheel_column(
     return np.where(is_covered(wheels.stamp_ns, at_ns, at_ns, least_ns=max_gap_ns), between, np.nan)
 
 
-def make_command_columns(command: Command | None, at_ns: NDArray[np.int64]) -> Arrays:
+def make_command_columns(command: Command | None, at_ns: Ints) -> Arrays:
     """Return the last command at each stamp; NaN before the first, while the topic is silent, and without commands."""
     none = np.empty(0)
     command = command or Command(np.empty(0, np.int64), none, none)
@@ -146,7 +142,7 @@ def make_command_columns(command: Command | None, at_ns: NDArray[np.int64]) -> A
     }
 
 
-def make_power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *, max_gap_ns: int) -> Arrays:
+def make_power_columns(streams: Streams, epoch: int, at_ns: Ints, *, max_gap_ns: int) -> Arrays:
     """Return voltage, current and power at each stamp; NaN in power gaps and without power."""
     values = compute_power_at(make_rails(streams, epoch), at_ns, max_gap_ns=max_gap_ns)
     return dict(zip(("voltage_volt", "current_amp", "power_watt"), values, strict=True))

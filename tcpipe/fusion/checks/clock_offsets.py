@@ -18,9 +18,8 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.checks.motions import (
     FIXES_S,
     GRID_S,
@@ -117,12 +116,13 @@ def shift_sensors(m: Measurements, offsets: Mapping[str, ClockOffset], middle_ns
     A receiver's velocity has the clock of its fixes.
     """
     offsets = {**offsets, **({DOPPLER: offsets[GNSS]} if GNSS in offsets else {})}
-    off = {role: sensor for role, sensor in m.sensors().items() if role in offsets}
-    stamps = {role: shift_stamps(sensor.stamp_ns, offsets[role], middle_ns) for role, sensor in off.items()}
-    return m.replace_sensors({role: replace(sensor, stamp_ns=stamps[role]) for role, sensor in off.items()})
+    off = ((role, sensor) for role, sensor in m.sensors().items() if role in offsets)
+    return m.replace_sensors(
+        {role: replace(of, stamp_ns=shift_stamps(of.stamp_ns, offsets[role], middle_ns)) for role, of in off}
+    )
 
 
-def shift_stamps(stamp_ns: NDArray[np.int64], offset: ClockOffset, middle_ns: int) -> NDArray[np.int64]:
+def shift_stamps(stamp_ns: Ints, offset: ClockOffset, middle_ns: int) -> Ints:
     """Return stamps [ns] without an offset and its drift."""
     return stamp_ns - np.rint(1e9 * _compute_lateness(offset, compute_seconds(stamp_ns, middle_ns))).astype(np.int64)
 
@@ -157,7 +157,7 @@ def make_pair(late: str, against: str, by: str, lag: Lag) -> ClockPair:
     return ClockPair(late, against, by, lag.offset_s, std_s, lag.explained, determined)
 
 
-def _iterate_signals(m: Measurements, at_ns: NDArray[np.int64]) -> Iterator[tuple[str, str, str, Signal, Signal]]:
+def _iterate_signals(m: Measurements, at_ns: Ints) -> Iterator[tuple[str, str, str, Signal, Signal]]:
     """Yield what can be compared: whose stamps against whose, by what, target and regressor on the grid, shape (M,)."""
     twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
     if m.imu is not None:

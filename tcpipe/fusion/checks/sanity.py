@@ -15,9 +15,8 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.checks.motions import (
     GRID_S,
     average,
@@ -79,7 +78,7 @@ Exclusions = dict[str, SensorExclusion]
 class Command:
     """Commands of a clock epoch: stamps [ns], forward velocity [m/s] and yaw rate [rad/s], sorted, shape (N,) each."""
 
-    stamp_ns: NDArray[np.int64]
+    stamp_ns: Ints
     forward_velocity_mps: Floats
     yaw_rate_radps: Floats
 
@@ -145,7 +144,7 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
     return found
 
 
-def _find_slow_rate_hz(stamp_ns: NDArray[np.int64]) -> float | None:
+def _find_slow_rate_hz(stamp_ns: Ints) -> float | None:
     """Return the median rate of an IMU whose samples are mostly too rare to show the motion, without pauses."""
     step_s = np.diff(stamp_ns) * 1e-9
     known_s = step_s[step_s <= PAUSE_NS * 1e-9]

@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 from unit.fusion.test_error_state import fuse
 
+from tcpipe.fusion.error_state import prepare_section
 from tcpipe.fusion.measurements import STATED_ARM_STD_M
 from tcpipe.fusion.parameters import PARAMETERS
+from tcpipe.fusion.state import Error
 
 DRAWN = (
     "antenna",
@@ -145,3 +147,11 @@ def test_a_straight_drive_without_slopes_shows_no_height_of_the_antenna():
     arm = fuse(measured).facts.parameters["antenna"]
     assert arm.std[2] == pytest.approx(arm.prior_std[2], rel=0.1)
     assert abs(arm.value[2]) < 0.3 * arm.prior_std[2]
+
+
+def test_errors_of_hours_stay_where_fixes_err_by_more_than_they_claim():
+    """Fixes of 3 cm that claim 1.5 cm show no constant error; half of the claim stays."""
+    m = drive.measure(drive.make_drive(60.0), 1, gnss_std=0.03, gnss_outliers=0.0)
+    gnss = replace(m.gnss, variance_m2=np.full_like(m.gnss.variance_m2, 0.015**2))
+    section = prepare_section(replace(m, gnss=gnss), m.gnss.stamp_ns[::20] // 50_000_000 * 50_000_000, 0.999)
+    assert section.std[Error.FIX_OFFSET] == pytest.approx(0.5 * 0.015)

@@ -56,7 +56,7 @@ def test_all_sensors_reach_centimetres_and_know_it(truth):
     assert _rms(np.hypot(errors[:, 0], errors[:, 1])) < 0.03
     assert (_rms(errors)[2:] < [0.04, 0.02, np.radians(0.8)]).all()
     assert (_rms(scaled) < 1.5).all()  # few errors of one drive are independent
-    assert (_rms(scaled) > 0.25).all()
+    assert (_rms(scaled) > 0.2).all()  # σ holds errors of hours, which one drive does not have
     assert set(trajectory.facts.measurements) == {GNSS, WHEELS, VISUAL}
     assert 0.7 < trajectory.facts.nis_mean[GNSS] < 1.2
 
