@@ -244,10 +244,11 @@ _STAMP = re.compile(
 _RUN_TEXT = (r"\d+(?=\D*$)", r"\d(?:[\d_.:T-]*\d)?", r"^[^_. -]+(?=[_ -])")
 """Parts of a file's name that differ between runs: the last number, date and time, the first word."""
 _TRIAL_NS = 60_000_000_000
-_MAX_REJECTED_SHARE = 0.2
 _SCALE_TOLERANCE = 0.03
 _CONTRADICTIONS = ("distance-contradicted", "drives-backwards", "yaw-rate-sign")
 """Findings of the first minute that contradict a table of wheel odometry or of an IMU."""
+_DIFFERENCES = ("measurements-rejected", "gnss-contradicts-odometry", "sensor-changed")
+"""Findings on fixes of the first minute that come from wrong wheel odometry, except where few fixes are rejected."""
 _HINTS = {
     "gnss": r"(.*_)?(lat|lon|lng|gps|gnss|alt)\w*",
     "imu": r"(.*_)?(a|g|w|acc|gyr|imu|omega|rot)([a-z]*_?[xyz]|\w{2,})",
@@ -549,9 +550,8 @@ def _try_lines(lines: Sequence[ProposedLine], log: Path, reasons: Mapping[str, s
     for finding in findings:
         why = f"in the first minute: {describe_finding(finding)}"
         blamed = finding.names.get("suspect", finding.subject.name)
-        if finding.code == "measurements-rejected" and blamed == "gnss":  # a minute of fixes is seldom wrong
-            is_wrong = finding.numbers["rejected_fraction"] > _MAX_REJECTED_SHARE
-            reasons |= {"tables.wheel_odometry": why} if is_wrong else {}
+        if finding.code in _DIFFERENCES and finding.subject.name == "gnss":  # a minute of fixes is seldom wrong
+            reasons |= {"tables.wheel_odometry": why} if finding.numbers.get("rejected_fraction", 1.0) > 0.2 else {}
         elif finding.code == "distance-contradicted" and blamed == "wheel_odometry" and "suspect" not in finding.names:
             lines = _scale_speed(lines, finding.numbers["distance_ratio"], why)
         elif finding.code in _CONTRADICTIONS and blamed in ("imu", "wheel_odometry"):
