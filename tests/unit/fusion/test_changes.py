@@ -152,6 +152,13 @@ def test_no_side_of_a_step_of_fixes_is_believed(share):
     assert drms_m[t > 120.0].min() > 0.47 * 0.3
 
 
+def test_of_two_odometries_alone_none_is_said_to_have_changed():
+    m = replace(drive.measure(truth(), 3, gnss=False, imu=False), imu=None)
+    t = (m.wheels.stamp_ns - drive.ZERO_NS) * 1e-9
+    slow = m.wheels.velocity_mps * np.where(t > 90.0, 0.5, 1.0)[:, None]
+    assert fuse(replace(m, wheels=replace(m.wheels, velocity_mps=slow))).facts.changes == ()
+
+
 def test_nothing_happened_in_a_clean_run():
     assert smoothed().facts.changes == ()
     assert smoothed(imu=False).facts.changes == ()
