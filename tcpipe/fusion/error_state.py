@@ -108,8 +108,8 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
 def _can_tell_changes(m: Measurements) -> bool:
     """Return whether another sensor shows the change, and fixes are no worse than a minute without them.
 
-    An IMU and an odometry carry it, or a camera that sees all turns. Without fixes two odometries need an IMU: alone
-    they do not show which of them changed.
+    An IMU and an odometry carry it, or a camera that sees all turns. Two odometries without fixes and IMU do not show
+    which of them changed.
     """
     if m.gnss is None:
         return len(m.odometries()) > 1 and m.imu is not None

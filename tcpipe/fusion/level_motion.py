@@ -271,7 +271,7 @@ class _Alignment:
             first = np.arange(0, time_s.size, apart)
             last = np.minimum(np.searchsorted(time_s, time_s[first] + window_s), time_s.size - 1)
             near = np.abs(time_s[last] - time_s[first] - window_s) < 0.3 * window_s
-            if near.sum() >= 3 * _FEWEST or window_s < 40.0 * std_m:  # half of it shows no heading at 0.5 m/s
+            if near.sum() >= 3 * _FEWEST or window_s < 40.0 * std_m:  # at 0.5 m/s half of it shows no heading
                 break
         first, last = first[near], last[near]
         self._start_s, self._end_s = time_s[first], time_s[last]

@@ -57,7 +57,7 @@ PARAMETERS = (
     Parameter("mounting of the pose", Error.POSE_MOUNT, 3, 0.0, 0.0, "rad", "`Positions.mounting_std_rad`"),
     Parameter("frame of the pose", Error.POSE_FRAME, 3, 0.05, 2e-3, "rad", "level to 3°; drifts by 1° a minute"),
 )
-"""Parameters with a prior of their own; that of scales of odometries and errors of fixes is by the run: `make_priors`."""
+"""Parameters with a prior of their own; `make_priors` finds scales of odometries and errors of fixes in the run."""
 FIX_AXES = np.array([1.0, 1.0, 1.7])
 """Ratio of lasting errors of fixes east, north and up [1]: no satellite is below."""
 _UNSEEN_SHARE = 0.25  # of the claimed variance of fixes [1]: errors of hours, by base, antenna and troposphere
@@ -125,8 +125,8 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
 def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> Floats:
     """Return the standard deviation of what fixes err throughout the section [m], shape (3,).
 
-    That is what fixes claim beyond the errors that the section shows, or a share of it; without tilt also the antenna's place, since an
-    antenna that sways looks like one elsewhere, and without heights, which show slopes, the sway.
+    Fixes claim it beyond the errors that the section shows; at least it is `_UNSEEN_SHARE` of the claimed variance.
+    Without tilt it includes the place of the antenna, which sways, and without heights, which show slopes, the sway.
     """
     axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
     shown, claimed = np.array([(fix.white + fix.correlated.variance, fix.claimed_m2) for fix in axes]).T

@@ -321,10 +321,8 @@ class BagPart(ChunkedPart[_Chunk]):
         places: list[tuple[int, int, int]] = []
         unsound = []
         records = [(chunk.offset, chunk.record) for chunk in chunks if chunk.record]
-        starts = [(each.end if each.codec == "none" else offset, each.end) for offset, each in records]
-        self._bytes.expect(
-            [(start, end + _INDEX_HEAD_BYTES - start) for start, end in starts]
-        )  # of a plain one, indexes
+        starts = [(r.end if r.codec == "none" else offset, r.end) for offset, r in records]  # plain: indexes only
+        self._bytes.expect([(start, end + _INDEX_HEAD_BYTES - start) for start, end in starts])
         for number, chunk in enumerate(chunks):
             try:
                 found = self._index_of(chunk)

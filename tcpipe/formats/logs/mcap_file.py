@@ -175,7 +175,9 @@ class McapPart(ChunkedPart[Chunk]):
         places: list[tuple[int, int, int, int]] = []
         unsound, before = [], 0
         starts = [(c.offset if c.compression else c.end, c) for c in chunks if c.index is not None]
-        self._bytes.expect([(start, c.end + c.index_bytes - start) for start, c in starts])  # of a plain one, indexes
+        self._bytes.expect(
+            [(start, c.end + c.index_bytes - start) for start, c in starts]
+        )  # a plain chunk: indexes first
         for number, chunk in enumerate(chunks):
             if chunk.index is None or chunk.cut or chunk.size > MAX_PLANNED_BYTES:
                 unsound.append(number)
