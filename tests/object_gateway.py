@@ -14,6 +14,8 @@ import pytest
 from obstore.store import from_url
 from storage_server import Fetched, object_store
 
+from tcpipe.formats import object_storage
+
 # Where a monitor of Ceph comes up at all it does so in seconds; where it does not, its client asks for five minutes.
 ATTEMPTS, SECONDS_EACH = 3, 90
 
@@ -99,6 +101,8 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fetched]
     (tmp_path / "served" / "tests").mkdir(parents=True)
     with object_store(tmp_path / "served") as (environment, fetched):
         in_environment(monkeypatch, environment, tmp_path / "cache")
+        # An earlier server of this process may have had the same port: this one has not answered yet.
+        monkeypatch.setattr(object_storage, "_has_answered", {})
         yield fetched
 
 
