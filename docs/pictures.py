@@ -37,6 +37,11 @@ def main() -> None:
         model, source = load_model(here / "model"), choose_map(here / "demo/store", None)
         survey = make_survey(model, source, 1.0)
         plans = [plan_path(survey, _START, _GOAL, objective, allow_extrapolation=True) for objective in OBJECTIVES]
+        least_energy, _, shortest = (plan.totals for plan in plans)
+        sys.stdout.write(
+            f"the shortest path needs {shortest.energy_joule / least_energy.energy_joule - 1:.1%} more energy than that of "
+            f"least energy, which is {least_energy.length_m / shortest.length_m - 1:.1%} longer\n"
+        )
         draw_plans(here / "plan.png", source, plans)
         plan = Image.open(here / "plan.png").convert("RGB")
         plan.thumbnail(_PLAN_PX)

@@ -93,7 +93,6 @@ def benchmark(
     default="full",
     help="The paper's site; a small site and a narrow network; or these for a few epochs, to see it run.",
 )
-@click.option("--quick", is_flag=True, help="The same as --size quick.")
 @click.option(
     "--seeds", default=1, type=click.IntRange(1, 100), help="Number of trainings; five or more decide the claims."
 )
@@ -103,7 +102,7 @@ def benchmark(
     help="Train networks of each class alone, with all layers and as Wei and Isler, which take most of the time.",
 )  # fmt: skip
 @add_output("reproduce")
-def reproduce(directory: str, *, size: Size, quick: bool, seeds: int, jobs: int, baselines: bool) -> Reproduction:
+def reproduce(directory: str, *, size: Size, seeds: int, jobs: int, baselines: bool) -> Reproduction:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and test the claims of the paper.
 
     Runs 'tcpipe benchmark' on it. Takes some two hours a training on two cores, minutes with --size small; an
@@ -112,7 +111,7 @@ def reproduce(directory: str, *, size: Size, quick: bool, seeds: int, jobs: int,
     """
     from tcpipe.experiment.reproduction import reproduce as run
 
-    return run(directory, size="quick" if quick else size, seeds=seeds, jobs=jobs, baselines=baselines)
+    return run(directory, size=size, seeds=seeds, jobs=jobs, baselines=baselines)
 
 
 @click.command("predict-path")

@@ -15,7 +15,7 @@ pytest.importorskip("torch")
 
 ENV = {"OMP_NUM_THREADS": "1"}
 LENGTH_M = 100.0
-"""Length of the three drives [m]; `tcpipe reproduce --quick` drives 190 m."""
+"""Length of the three drives [m]; `tcpipe reproduce --size quick` drives 190 m."""
 
 OWN = """
 import numpy as np
@@ -35,7 +35,7 @@ def make_short_drives():
 def reproduced(tmp_path_factory):
     here, short = tmp_path_factory.mktemp("reproduced"), make_short_drives()
     with patch.dict(scenarios.SCENARIOS, paper_quick=lambda: short):
-        done = tcpipe("reproduce", "here", "--quick", cwd=here, env=ENV)
+        done = tcpipe("reproduce", "here", "--size", "quick", cwd=here, env=ENV)
         assert done.returncode == 0, done.stderr
         yield here, done
 
@@ -93,7 +93,7 @@ def test_even_a_quick_network_learns_that_slope_costs_time(reproduced):
 def test_again_is_nothing_to_do(reproduced):
     here, first = reproduced
     before = (here / "here" / "reproduction.json").read_bytes()
-    again = tcpipe("reproduce", "here", "--quick", "--seeds", "1", "--jobs", "1", cwd=here, env=ENV)
+    again = tcpipe("reproduce", "here", "--size", "quick", "--seeds", "1", "--jobs", "1", cwd=here, env=ENV)
     assert again.returncode == 0
     assert not {"fusing", "epoch"} & set(re.findall(r"\w+", again.stderr))
     assert (here / "here" / "reproduction.json").read_bytes() == before
