@@ -8,7 +8,7 @@ The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dat
 from importlib import import_module
 from typing import Any
 
-__version__ = "2.0.0.dev2"
+__version__ = "2.0.0"
 
 _HOMES = {
     "read_log": ("tcpipe.api", "read_log"),

@@ -12,6 +12,7 @@ import click
 import pytest
 from synthetic_store import box, region_file, small_store
 
+from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.formats.recipe_toml import parse_recipe
 from tcpipe.pipeline.dataset.build import build_dataset
@@ -73,6 +74,12 @@ def test_each_answer_has_a_command_and_at_most_120_words() -> None:
 def test_the_changelog_of_versions_before_2_has_at_most_60_lines() -> None:
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert len(text[text.index("## 1.0.0") :].splitlines()) <= 60
+
+
+def test_changelog_and_citation_are_of_this_version() -> None:
+    changelog, citation = ((ROOT / name).read_text(encoding="utf-8") for name in ("CHANGELOG.md", "CITATION.cff"))
+    assert re.findall("^## (.*)", changelog, re.MULTILINE)[0] == __version__
+    assert re.findall("^version: (.*)", citation, re.MULTILINE) == [__version__]
 
 
 def test_every_decision_stands_once_in_the_index() -> None:
