@@ -23,12 +23,10 @@ from scipy.special import stdtrit
 from tcpipe.arrays import AnyInts, Floats, Mask
 from tcpipe.cost.prediction_errors import COVERAGE, NORMAL_HALF_WIDTH, QuantityErrors, SumDistribution
 
-_CHANGES = {0.0: 0.7, 0.1: 0.15, 0.3: 0.15}
-"""Prior probability of each standard deviation q of a relative change."""
+_CHANGES = {0.0: 0.7, 0.1: 0.15, 0.3: 0.15}  # prior probability of each standard deviation q of a relative change
 _RISE_M, _TURN_RAD = 0.1, 0.3
 """Rise and turn that cost about as much as a metre."""
-_FREEDOM = 20.0
-"""Weight of the prior of s² [metres]."""
+_FREEDOM = 20.0  # weight of the prior of s² [metres]
 _PLACE_SHARE, _PLACE_M = 0.2, 30.0
 """Share of the variance of errors that metres within a distance have in common [1], and that distance [m]; held-out
 samples show a smaller share."""

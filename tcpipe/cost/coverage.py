@@ -31,8 +31,7 @@ class Coverage:
         return f"{100.0 * self.fraction:.1f} % ({interval}, {self.runs} runs)"
 
 
-_FEWEST_RUNS = 5
-"""Runs without which a coverage has no interval: two or three do not show how runs differ."""
+_FEWEST_RUNS = 5  # runs without which a coverage has no interval: two or three do not show how runs differ
 
 
 def measure_coverage(is_inside: Mask, runs: GenericArray) -> Coverage:

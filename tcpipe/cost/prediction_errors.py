@@ -52,8 +52,7 @@ _TAIL = (1.0 - COVERAGE) / 2.0
 NORMAL_HALF_WIDTH = 1.6448536269514722
 """Half-width of a normal interval of `COVERAGE`, in standard deviations."""
 _CLASSES = 256
-_HALFWAY = 20.0
-"""Samples of a class for which its spread is the geometric mean of its own and that of all."""
+_HALFWAY = 20.0  # samples of a class for which its spread is the geometric mean of its own and that of all
 _ENOUGH_RUNS, _BLOCK = 10, 20
 """Fewest runs that are the clusters of a bias; with fewer, clusters are this many consecutive held-out samples."""
 _MOST_BIAS = 0.5
@@ -432,8 +431,7 @@ def _estimate_ratio(predicted: Floats, true: Floats, block: Ints) -> tuple[float
     return found, float(np.sqrt((of_block**2).sum() * several / (several - 1.0))) / whole
 
 
-_ONE_FOLD_FREEDOM = 5.0
-"""Degrees of freedom of the spread of errors of one fold."""
+_ONE_FOLD_FREEDOM = 5.0  # degrees of freedom of the spread of errors of one fold
 
 
 def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Floats, stated: Floats) -> QuantityErrors:

@@ -14,8 +14,7 @@ from scipy.special import stdtrit
 from tcpipe.arrays import AnyInts, Floats, Ints
 from tcpipe.tables.facts import Floor
 
-_FEWEST_FITTED = 12
-"""Below so many samples a class is described by its mean, not by a parabola over slope."""
+_FEWEST_FITTED = 12  # below so many samples a class is described by its mean, not by a parabola over slope
 
 
 def compute_slope_residuals(values: Floats, terrain_class: AnyInts, slope_rad: Floats) -> Floats:
@@ -35,10 +34,8 @@ NEAR = 0.25
 ALONG_RAD = np.radians(10.0)
 """Largest difference of courses of one direction [rad]; with NEAR it bounds position and course as an ellipsoid."""
 
-_CHUNK = 65_536
-"""Samples whose nearest are looked for together."""
-_BLOCK = 10.0
-"""Side of a jackknife block, in chords."""
+_CHUNK = 65_536  # samples whose nearest are looked for together
+_BLOCK = 10.0  # side of a jackknife block, in chords
 _FEWEST_BLOCKS = 5
 _CONFIDENCE = 0.95
 

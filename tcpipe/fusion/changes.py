@@ -1,9 +1,10 @@
 """Explain contradictions between sensors by changes: steps of fixes or clocks, moved antennas, scales, biases.
 
-A change makes one block of the state uncertain at a tick, and again where it ends. `error_state.smooth_section` finds when,
-by the log evidence of such an impulse at every tick. A step of fixes makes them uncertain on both sides, since nothing
-shows which side is right. Errors may also be larger than usual throughout. Sets of changes are compared by the
-likelihood of all measurements, in which a measurement beyond the gate counts as the gate, less a cost by kind.
+A change makes one block of the state uncertain at its first tick and at its last tick. `error_state.smooth_section`
+computes the log evidence of such an impulse at every tick, and so finds the ticks. A step of fixes makes the fixes on
+both sides uncertain, since it is unknown which side is right. Errors may also be larger than usual in the whole
+section. Sets of changes are compared by the likelihood of all measurements less a cost for each kind of change. In this
+likelihood, a measurement beyond the gate has the value of the gate.
 """
 
 from __future__ import annotations
@@ -39,15 +40,15 @@ POSSIBLE = (
     Error.WHEEL_LAG,
     Error.VISUAL_LAG,
 )
-"""Errors that changes change, beside those that always vary."""
+"""Errors that only changes affect; other errors always vary."""
 
 
 @dataclass(frozen=True, slots=True)
 class EventKind:
     """Errors that an event changes, each with the standard deviation of the change, in its unit.
 
-    ``cost``: log of how unlikely it is beforehand [nat]. ``least``: norm of the change of its first three errors; what
-    is smaller is noise.
+    ``cost``: negative log of the prior probability [nat]. ``least``: smallest norm of the change of its first three
+    errors; smaller changes are noise.
     """
 
     block: tuple[tuple[int, float], ...]
@@ -77,7 +78,7 @@ EVENTS: Mapping[tuple[str, int], EventKind] = {
         1.0,
     ),
 }
-"""Events by their name and the sensor that they are of."""
+"""Events by name and kind of measurement of their sensor."""
 LARGER_ERRORS: Mapping[tuple[str, int], tuple[float, ...]] = {
     ("noise", Kind.FIX): (0.03, 0.06, 0.12, 0.24),  # m, from RTK's usual error to a wrong ambiguity
     ("slow", Kind.FIX): (0.03, 0.06, 0.12, 0.24),
@@ -85,19 +86,18 @@ LARGER_ERRORS: Mapping[tuple[str, int], tuple[float, ...]] = {
     ("varies", Kind.VISUAL): (0.05, 0.1, 0.2),
     ("accelerometer", Kind.STATIONARY_RATE): (0.1, 0.3, 1.0),  # m/s²: its bias follows speed or temperature
 }
-"""Errors that may be larger than usual in a section, by name and sensor, and the tried sizes [their unit], 1σ."""
-_VARIES_S = 5.0
-"""Correlation time of a scale or a bias that varies [s]."""
+"""Errors that may be larger than usual in a section, by name and sensor; tested sizes [unit of the error], 1σ."""
+_VARIES_S = 5.0  # correlation time of a scale or a bias that varies [s]
 _REJECTED_S: Mapping[int, float] = {Kind.FIX: 1.0, Kind.WHEELS: 4.0, Kind.VISUAL: 4.0, Kind.ATTITUDE: 4.0}
-"""How long a sensor that is not wrong may be rejected without a break [s]: wheels slip for seconds."""
+"""Longest time for which a correct sensor may be rejected without a break [s]: wheels slip for seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One change: its kind, the sensor it is of, and its first and last tick (None: to the end of the section).
+    """One change: its kind, its sensor, and its first and last tick (None: the end of the section).
 
-    ``size``: how large it is, in the unit of what changes. ``impulse``: by how much the errors of its block change, and
-    its deviation.
+    ``size``: magnitude, in the unit of the changed error. ``impulse``: change of the errors of its block;
+    ``impulse_std``: its standard deviation.
     """
 
     kind: str
@@ -110,20 +110,20 @@ class Change:
 
     @property
     def cost(self) -> float:
-        """Log of how unlikely it is beforehand."""
+        """Negative log of the prior probability [nat]."""
         if (self.kind, self.role) in EVENTS:
             return EVENTS[self.kind, self.role].cost + (0.0 if self.last is None else 2.0)
         return EVENTS["offset", Kind.FIX].cost if self.kind == "step" else 0.0
 
     def list_events(self) -> Iterator[Event]:
-        """Yield what it changes in the state."""
-        if self.kind == "step":  # drawn from the prior that `Hypothesis.alter_priors` gives
+        """Yield the events by which this change acts on the state."""
+        if self.kind == "step":  # its prior: see `Hypothesis.alter_priors`
             yield from (Event(self.first, Error.FIX_OFFSET + axis, is_new=True) for axis in range(3))
         elif (self.kind, self.role) in EVENTS:
             block = EVENTS[self.kind, self.role].block
             for (place, prior_std), found, found_std in zip(block, self.impulse, self.impulse_std, strict=True):
-                is_pose = place < Error.GYRO_BIAS  # its errors are along axes that the change turns: they have no mean
-                # The filter estimates the others again from the same measurements: three of their σ.
+                is_pose = place < Error.GYRO_BIAS  # the change rotates the axes of its errors: no mean
+                # The filter estimates the other errors again from the same measurements: use 3σ.
                 std, mean = (prior_std, 0.0) if is_pose else (min(prior_std, 3.0 * found_std), found)
                 yield Event(self.first, place, std, mean)
                 if self.last is not None:
@@ -143,13 +143,13 @@ class Hypothesis:
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Events in the state by all changes, in order of time."""
+        """All events of the changes, in order of time."""
         return tuple(sorted((e for c in self.changes for e in c.list_events()), key=lambda event: event.tick))
 
     def alter_ticks(self, ticks: Ticks) -> Ticks:
-        """Return the ticks as they are under all changes."""
+        """Return the ticks, altered by all changes."""
         for change in (each for each in self.changes if each.kind == "noise"):
-            # Reflected signals change as the antenna moves by a metre.
+            # Multipath errors change when the antenna moves by a metre.
             kept = np.full_like(ticks.inputs.fix_kept, np.exp(-ticks.inputs.period_s / 1.5))
             variance = np.maximum(ticks.fix_variance_m2, np.square(change.size * FIX_AXES))
             inputs = ticks.inputs._replace(fix_kept=kept, fix_noise=compute_process_noise(kept, variance))
@@ -157,13 +157,13 @@ class Hypothesis:
         return ticks
 
     def alter_priors(self, std: Floats, walk: Floats, time_s: Floats) -> None:
-        """Change standard deviation, walk and correlation time of all errors, (45,), to those with all changes."""
+        """Change the standard deviation, walk and correlation time of all errors, (45,), in place for all changes."""
         offset = slice(Error.FIX_OFFSET, Error.FIX_OFFSET + 3)
         for change in self.changes:
-            if change.kind in {"step", "slow"}:  # either side of a step may be right: both are off by half of it, 1σ
+            if change.kind in {"step", "slow"}:  # either side may be right: each errs by half of the step, 1σ
                 share = 0.5 if change.kind == "step" else 1.0
                 std[offset] = np.maximum(std[offset], share * change.size * FIX_AXES)
-                time_s[offset] = 60.0  # the paths of reflected signals change with the satellites
+                time_s[offset] = 60.0  # s; multipath changes with the satellites
             elif change.kind == "varies":
                 slip = Error.WHEEL_SLIP if change.role == Kind.WHEELS else Error.VISUAL_SLIP
                 std[slip], time_s[slip] = change.size, _VARIES_S
@@ -173,7 +173,7 @@ class Hypothesis:
 
 
 def is_contradicted(tests: Tests, period_s: float) -> bool:
-    """Return whether a sensor is rejected more often, or longer without a break, than one that is not wrong."""
+    """Return whether a sensor is rejected more often, or longer without a break, than a correct sensor."""
     most = read_threshold("measurements-rejected", "max_rejected_fraction")
     for kind in _REJECTED_S:
         rows = np.flatnonzero(tests.verdict[:, kind] != GateVerdict.NONE)
@@ -186,8 +186,8 @@ def is_contradicted(tests: Tests, period_s: float) -> bool:
 def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
     """Return the measurements of ticks without outliers, shape (K, 9, 3).
 
-    A spike among its neighbours is an outlier, and so is a rejected measurement, except in a long run of rejections,
-    which a change may explain.
+    An outlier is a spike among its neighbours, or a rejected measurement outside long runs of rejections; a change may
+    explain such a run.
     """
     value = ticks.inputs.value.copy()
     for kind in (Kind.WHEELS, Kind.VISUAL, Kind.FIX):
@@ -207,10 +207,7 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
 
 
 def _find_long_runs(rows: Ints, mask: Mask, period_s: float, kind: int) -> list[tuple[int, int]]:
-    """Return runs of true measurements, first and last row, that last longer than a correct sensor is rejected.
-
-    The last row is excluded. Fewer than five rows are single outliers.
-    """
+    """Return first and last row of each run of true values that lasts longer than a correct sensor is rejected."""
     edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
     lasts_s = (rows[edges[:, 1] - 1] - rows[edges[:, 0]] + 1) * period_s
     long = (np.diff(edges, axis=1)[:, 0] >= 5) & (lasts_s >= _REJECTED_S[kind])
@@ -218,7 +215,10 @@ def _find_long_runs(rows: Ints, mask: Mask, period_s: float, kind: int) -> list[
 
 
 def join_events(events: Sequence[Change]) -> tuple[Change, ...]:
-    """Return changes by events in the order found: an event that undoes another ends it; a lasting offset is a step."""
+    """Return the changes that events make up, in the order found.
+
+    An event that reverses an earlier one ends that change. A permanent offset is a step.
+    """
     single: list[Change] = []
     for event in sorted(events, key=lambda each: (each.kind, each.role, each.first)):
         before = single[-1] if single and (single[-1].kind, single[-1].role) == (event.kind, event.role) else None
@@ -231,7 +231,7 @@ def join_events(events: Sequence[Change]) -> tuple[Change, ...]:
         before = joined[-1] if joined and (joined[-1].kind, joined[-1].role) == (event.kind, event.role) else None
         if before is not None and before.last is None:
             rest = np.linalg.norm(np.add(before.impulse, event.impulse))
-            if rest < 0.4 * np.linalg.norm(before.impulse):  # share that the end of a change leaves [1]
+            if rest < 0.4 * np.linalg.norm(before.impulse):  # largest remainder after the end of a change [1]
                 joined[-1] = replace(before, last=event.first)
                 continue
         joined.append(event)
@@ -240,6 +240,6 @@ def join_events(events: Sequence[Change]) -> tuple[Change, ...]:
 
 
 def compute_evidence(tests: Tests, gates: Floats) -> float:
-    """Return the log likelihood of all measurements; one beyond the gate counts as the gate."""
+    """Return the log likelihood of all measurements; a measurement beyond the gate has the value of the gate."""
     kinds = [Kind.WHEELS, Kind.VISUAL, Kind.DOPPLER, Kind.FIX, Kind.ATTITUDE]
     return float(-0.5 * np.nansum(np.minimum(tests.nis[:, kinds], gates[kinds]) + tests.log_det[:, kinds]))

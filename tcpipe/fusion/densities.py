@@ -1,7 +1,7 @@
-"""Noise of each sensor, estimated from the run by pairwise residuals at several time differences.
+"""Noise of each sensor, estimated from residuals of pairs of sensors over several time differences.
 
-`fit_noise` returns a `NoiseModel`: a `SensorNoise` for each quantity that a sensor measures. Densities are never
-evidence against a sensor.
+`fit_noise` returns a `NoiseModel`: a `SensorNoise` for each quantity that a sensor measures. No sensor is excluded
+because of its noise. The *claimed* variance of a fix is the one that the receiver reports.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 
 from tcpipe.arrays import Floats, Ints
 from tcpipe.fusion.level_motion import KNOT_S, get_turn_rates
-from tcpipe.fusion.measurements import IMU, NO_TRUST, Measurements, Positions
+from tcpipe.fusion.measurements import IMU, MAX_VARIANCE, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, UP, Residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
 from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std
@@ -22,9 +22,9 @@ from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std
 
 @dataclass(frozen=True, slots=True)
 class GaussMarkov:
-    """A stationary process with covariance ``variance * exp(-|dt| / time_s)``; variance in the squared unit.
+    """Stationary process with covariance ``variance * exp(-|dt| / time_s)``; variance in the squared unit.
 
-    Without a time white noise, by its density.
+    Without ``time_s`` it is white noise, and ``variance`` is its density.
     """
 
     variance: float
@@ -37,18 +37,18 @@ class GaussMarkov:
 
 @dataclass(frozen=True, slots=True)
 class SensorNoise:
-    """Errors of one measured quantity: white noise, and a Gauss-Markov process, which becomes a state of a filter.
+    """Errors of one quantity: white noise, and a Gauss-Markov process, which is a state of the filter.
 
     Attributes
     ----------
-    white : of fixes along an axis the variance of each [m²]; of an odometry the variance that its distance gains in a
-        second of driving [m²/s], zero while the robot is stationary; of a yaw rate the variance that its angle gains in
-        a second [rad²/s]. A rate at f Hz has the variance ``white * f``.
-    correlated : of fixes the error of position [m], the process whose structure function is nearest to the fitted sum
-        of processes between 1 and 40 s; of an odometry that of its scale around its mean [1]; of a yaw rate that of its
-        bias around its mean [rad/s].
-    claimed_m2 : median variance of the fixes of a run; both parts are those of a fix of this claim, and in proportion
-    to it.
+    white : for fixes, the variance along an axis [m²]; for an odometry, the variance that its distance gains in
+        a second of driving [m²/s], zero while the robot is stationary; for a yaw rate, the variance that its angle
+        gains in a second [rad²/s]. A rate at f Hz has the variance ``white * f``.
+    correlated : for fixes, the error of position [m]: the process with the structure function nearest to the fitted sum
+        of processes between 1 and 40 s; for an odometry, the error of its scale around its mean [1]; for a yaw rate,
+        its bias around its mean [rad/s].
+    claimed_m2 : median claimed variance of the fixes of a run. ``white`` and ``correlated`` belong to a fix with this
+        claim; for other fixes they are proportional to the claim.
     """
 
     white: float
@@ -58,9 +58,9 @@ class SensorNoise:
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Noise of all sensors of a section; ``horizontal`` (east, north) and ``vertical`` are of fixes, None without.
+    """Noise of all sensors of a section; ``horizontal`` (east, north) and ``vertical``: of fixes, None without fixes.
 
-    ``shared_scale`` is the error of the scale of all odometries at once.
+    ``shared_scale`` is the scale error that all odometries have in common.
     """
 
     horizontal: SensorNoise | None
@@ -75,19 +75,19 @@ PRIORS = {
     # atmosphere and orbits.
     "fix, centimetres": GaussMarkov(0.3, 15.0),
     "fix, more": GaussMarkov(0.8, 60.0),
-    # m²/s beside the noise that the samples show: 2 mm after a second.
+    # m²/s, added to the noise observed in the samples: 2 mm after a second.
     "wheel_odometry velocity": GaussMarkov(4e-6),
     "visual_odometry velocity": GaussMarkov(4e-6),
-    # [1]: slip by load and ground; cameras vary by 5 to 15 % on slopes. Shared: tilt and slip that no pair of
-    # odometries shows.
+    # [1]: slip that depends on load and ground; cameras vary by 5 to 15 % on slopes. Shared: tilt and slip that
+    # differences of odometries do not contain.
     "wheel_odometry scale": GaussMarkov(0.01**2, 30.0),
     "visual_odometry scale": GaussMarkov(0.03**2, 30.0),
     "shared scale": GaussMarkov(0.003**2, 30.0),
     "slide velocity": GaussMarkov(1e-4),  # m²/s: 1 cm sideways after a second
-    # rad²: what the alignment leaves of heading and pitch; roll and pitch where no accelerometer measures them.
+    # rad²: errors of heading and pitch after the alignment; roll and pitch if no accelerometer measures them.
     "heading scale": GaussMarkov(0.005**2, 30.0),
     "pitch scale": GaussMarkov(0.0015**2, 30.0),
-    # rad²/s beside the noise that the samples show.
+    # rad²/s, added to the noise observed in the samples.
     "imu turn": GaussMarkov(1e-8),
     "wheel_odometry turn": GaussMarkov(1e-5),
     "visual_odometry turn": GaussMarkov(1e-6),
@@ -100,36 +100,36 @@ PRIORS = {
     "wheel_odometry turn scale": GaussMarkov(0.1**2, 100.0),
     "visual_odometry turn scale": GaussMarkov(0.02**2, 100.0),
 }
-"""Variances before the fit, and densities of white noise, which have no correlation time; units in the comments."""
+"""Prior variances, and densities of white noise, which have no correlation time; units in the comments."""
 
-_NO_PROCESS = GaussMarkov(0.0, 10.0)  # [s]: without variance any correlation time does
+_NO_PROCESS = GaussMarkov(0.0, 10.0)  # [s]: any correlation time, since the variance is zero
 _FLOOR_M, _FLOOR_SHARE = 0.002, 0.0025
-"""Least white noise of fixes, absolute and of the claimed variance: filters repeat their errors to 0.1 mm."""
-_CENTIMETRES_M2 = 0.1**2  # fixes that claim less are RTK's
-_SUMMARY_S = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 40.0])  # where one process stands for a sum
+"""Least white noise of fixes [m], and as a share of the claimed variance [1]: filters repeat their errors to 0.1 mm."""
+_CENTIMETRES_M2 = 0.1**2  # fixes that claim less are RTK fixes
+_SUMMARY_S = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 40.0])  # at these times one process approximates a sum
 _SUMMARY_TAU_S = np.geomspace(2.0, 100.0, 40)
 _ROUNDS = 16  # rounds of the fit [1]; medians in the first half, means below the gate in the second
 _GATE = 9.0  # gate of z² [1], 3σ
 _TRUNCATED = 0.9733  # mean of a χ² variate of one degree of freedom below the gate [1]
 _LEAST_WINDOWS = 15.0  # windows of the longest length in a section [1]: fewer do not determine a variance
-_FEW_WINDOWS, _FEW_WINDOWS_S = 4.0, 20.0  # longer windows by this factor [1] enter the fit up to this length [s]
-_PROCESS_MARGIN = 0.6  # standard deviations of a fitted process [1] by which the filter's is larger
-_REDUNDANCY = 2.0  # windows per independent one [1]: other lengths and axes share their errors
-_FEWEST = 8  # fewest windows of a cell [1]
-_MAX_VARIANCE_RATIO = 1.5  # shown over stated variance of fixes without claims [1]; above it the shown one counts
+_FEW_WINDOWS, _FEW_WINDOWS_S = 4.0, 20.0  # largest factor [1] and length [s] of longer windows in the fit
+_PROCESS_MARGIN = 0.6  # the filter uses a process larger by this many standard deviations [1]
+_REDUNDANCY = 2.0  # windows per independent window [1]: lengths and axes share errors
+_MIN_ROWS = 8  # fewest windows of a cell [1]
+_MAX_VARIANCE_RATIO = 1.5  # observed over stated variance of unclaimed fixes [1]; above it, observed
 _CODE_PHASE_M2 = 1.5**2  # variance of each axis [m²]; GPS Standard Positioning Service, Performance Standard 2020
-_PROCESS_STD = 0.6  # 1σ of the share of the claim [1] that one correlation time has
-_AXES_STD = 0.25  # 1σ of the difference of processes in the plane and of heights [1], by their total
-_MAX_PRIOR_GROWTH = 25.0  # largest factor [1] by which a prior's standard deviation grows with the density
-_CLAIM_LASTS_S = 0.05  # correlation time of the error that an odometry claims [s]
+_PROCESS_STD = 0.6  # 1σ of the share of the claimed variance [1] at one correlation time
+_AXES_STD = 0.25  # 1σ of the relative difference of horizontal and vertical processes [1]
+_MAX_PRIOR_GROWTH = 25.0  # largest factor by which a prior's σ grows with the density [1]
+_CLAIM_LASTS_S = 0.05  # correlation time of the claimed error of an odometry [s]
 _ROUNDING = 1e-10  # variance of rounding [m²]
 
 
 def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements:
-    """Return measurements whose fixes claim the observed noise, if most have no claim and the recipe's is too small.
+    """Inflate the variance of fixes to the observed noise, if most have no claim and the recipe's is too small.
 
-    Fixes with an error above a decimetre have no fixed ambiguities: they err as the code phase does, for longer than a
-    run can show.
+    Fixes with an error above a decimetre are not RTK-fixed. Their errors have the correlation of code-phase errors,
+    which last longer than a run can measure.
     """
     if m.gnss is None or m.gnss.unclaimed is None or m.gnss.has_claims:
         return m
@@ -146,7 +146,7 @@ def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> 
 
 
 def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> NoiseModel:
-    """Return the noise of each sensor by the residuals of `find_residuals`: heights first, then the plane."""
+    """Return the noise of each sensor, fitted to the residuals of `find_residuals`: first heights, then the plane."""
     prior = make_prior_model(measurements)
     if not residuals:
         return prior
@@ -155,7 +155,7 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
     by_heights, of_heights = _Fit([each for each in residuals if each.axis == UP], prior, {}, longest_s), {}
     horizontal = prior.horizontal
     has_claims = measurements.gnss is not None and measurements.gnss.has_claims
-    if has_claims and prior.vertical and prior.vertical.claimed_m2 < NO_TRUST:
+    if has_claims and prior.vertical and prior.vertical.claimed_m2 < MAX_VARIANCE:
         vertical = by_heights.find_noise(prior.vertical, "up white", "up process")
         prior, of_heights = replace(prior, vertical=vertical), by_heights.get_densities()
     plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, of_heights, longest_s)
@@ -173,17 +173,17 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
 
 @dataclass(frozen=True, slots=True)
 class _Cell:
-    """Residuals of a pair, axis and length, of a moving or stationary robot; ``features`` (M, C), ``square`` (M,)."""
+    """Residuals of one pair, axis and window length, moving or stationary; ``features`` (M, C), ``square`` (M,)."""
 
     residuals: Residuals
     is_still: bool
     features: Floats
     square: Floats
     apart_s: float
-    """Between the starts of windows that follow each other."""
+    """Time between the starts of successive windows [s]."""
 
     def find_level(self, variances: Floats, *, truncated: bool) -> tuple[Floats, float]:
-        """Return the features over the fitted sum, their mean (C,), and the level of the squares in the same unit."""
+        """Return the features over the fitted sum, their mean (C,), and the level of the squares."""
         fitted = multiply_by_vector(self.features, variances) + _ROUNDING
         z2 = self.square / fitted
         relative = (self.features / fitted[:, None]).mean(0)
@@ -216,24 +216,24 @@ class _Fit:
             )
             counts = self._count_windows(cells)
             weight = np.sqrt(0.5 * counts)
-            # A prior's standard deviation grows with the density, so that the prior does not bound a large one.
+            # The σ of a prior grows with the density, so that the prior does not bound a large density.
             std = np.clip(self._variances, self._std, _MAX_PRIOR_GROWTH * self._std)
             matrix = np.concatenate((np.array(rows) * weight[:, None], np.diag(1.0 / std)))
-            # The logarithm of a level misfits alike where the sum is too large and where it is too small.
-            # Its mean is below that of the level by 1 / n.
+            # The misfit of the logarithm is symmetric for sums that are too large and too small.
+            # The mean of the logarithm is too small by 1 / n.
             logarithm = np.log(levels) + np.minimum(1.0 / (_REDUNDANCY * counts), 0.5)
             target = np.concatenate(((1.0 + logarithm) * weight, self._mean / std))
-            # Solved in units of the prior, so that rounding does not decide.
+            # Solve in units of the prior, to reduce rounding errors.
             fitted = nnls(matrix * std, target)[0] * std
             self._variances = 0.5 * (self._variances + fitted)
             self._covariance = np.linalg.inv(np.einsum("mi,mj->ij", matrix, matrix))
 
     def _count_windows(self, cells: Sequence[_Cell]) -> Floats:
-        """Return how many windows of each cell are independent.
+        """Return the number of independent windows of each cell.
 
         Windows of length Δ that begin s apart have the correlation (D(Δ + s) + D(|Δ - s|) - 2 D(s)) / 2 D(Δ), with the
-        structure function D of the fitted sum: overlapping windows of white noise are independent of each other, those
-        of a random walk are not.
+        structure function D of the fitted sum. Overlapping windows are independent for white noise, but not for a
+        random walk.
         """
         levels: dict[tuple[tuple[str, str], str, bool], list[tuple[float, float]]] = {}
         for cell in cells:
@@ -259,16 +259,16 @@ class _Fit:
         return dict(zip(self._names, self._variances.tolist(), strict=True))
 
     def find_noise(self, prior: SensorNoise, white: str, *processes: str) -> SensorNoise:
-        """Return the noise of a sensor by the names of its white density and of its processes."""
+        """Return the noise of a sensor from the names of its white density and of its processes."""
         density = self.get_densities().get(white, prior.white)
         floor = max(_FLOOR_M**2, _FLOOR_SHARE * prior.claimed_m2) if prior.claimed_m2 else 0.0
         correlated = self.find_process(prior.correlated, *processes)
         return SensorNoise(max(density, floor), correlated, prior.claimed_m2)
 
     def find_process(self, prior: GaussMarkov, *names: str) -> GaussMarkov:
-        """Return the Gauss-Markov process that is nearest to the sum of those of these names.
+        """Return the Gauss-Markov process that is nearest to the sum of the named processes.
 
-        Over times that are too long for the section it is the larger of fit and prior.
+        At times that are too long for the section, it is the larger of fit and prior.
         """
         taus = {
             row: float(name.rpartition(" ")[2])
@@ -290,17 +290,17 @@ def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
     """Yield the residuals of the moving and of the stationary robot, without exact zeros of repeated values."""
     features = np.stack([each.features.get(name, np.zeros(each.value.size)) for name in names], -1)
     for is_still in (False, True):
-        if is_still:  # what little the robot moves then must not explain them
+        if is_still:  # the small motions of a stationary robot must not explain them
             features = features * np.array([" scale" not in name for name in names])
         rows = np.flatnonzero((each.is_still == is_still) & np.isfinite(each.value) & (each.value != 0.0))
-        if rows.size < _FEWEST:
+        if rows.size < _MIN_ROWS:
             continue
         apart_s = float(np.median(np.diff(each.start_ns[rows]))) * 1e-9
         yield _Cell(each, is_still, features[rows], np.square(each.value[rows]), apart_s)
 
 
 def _find_prior(name: str, prior: NoiseModel, of_heights: Mapping[str, float]) -> tuple[float, float]:
-    """Return mean and standard deviation of a density before the fit; ``of_heights``: fitted densities of heights."""
+    """Return prior mean and standard deviation of a density; ``of_heights``: fitted densities of heights."""
     kind, _, last = name.rpartition(" ")
     if name.startswith(("fix ", "up ")) and prior.horizontal is not None and prior.vertical is not None:
         return _find_fix_prior(name, prior.horizontal, prior.vertical, of_heights)
@@ -311,17 +311,17 @@ def _find_prior(name: str, prior: NoiseModel, of_heights: Mapping[str, float]) -
     elif kind == "heading scale":
         variance = _find_heading_variance(prior)
     share = _share_process(known.time_s, float(last), SCALE_S) if known.time_s else 1.0
-    # The scale of an odometry may well vary by several times as much.
+    # The scale of an odometry often varies several times as much.
     return share * variance, 4.0 * variance if kind.endswith("odometry scale") else variance
 
 
 def _find_fix_prior(
     name: str, horizontal: SensorNoise, vertical: SensorNoise, of_heights: Mapping[str, float]
 ) -> tuple[float, float]:
-    """Return the noise of fixes in the plane from that of heights by the ratio of claims, where heights are compared.
+    """Return the prior noise of fixes in the plane: that of heights times the ratio of claims, if heights are compared.
 
-    Heights are compared with a track whose pitch hardly errs, while an odometry's scale hides slow errors of fixes in
-    the plane.
+    Heights are compared with a track whose pitch error is small. In the plane, the scale of an odometry hides slow
+    errors of fixes.
     """
     axis, kind, time_s = (*name.split(), "0")[:3]
     fixes = vertical if axis == "up" else horizontal
@@ -336,19 +336,19 @@ def _find_fix_prior(
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:
-    """Return the variance of the heading [rad²] between the knots of the alignment: of a Brownian bridge."""
+    """Return the variance of the heading [rad²] between knots of the alignment, for a Brownian bridge."""
     best = next(iter(prior.turns.values()))
     return KNOT_S / 6.0 * best.white + KNOT_S**2 / 100.0 * best.correlated.variance
 
 
 def _share_process(time_s: float, tau_s: float, taus_s: Sequence[float]) -> float:
-    """Return the part of a process that belongs to one of several correlation times: linear in their logarithm."""
+    """Return the part of a process that belongs to one of several correlation times: linear in log time."""
     place = np.interp(np.log(time_s), np.log(taus_s), np.arange(len(taus_s)))
     return float(max(0.0, 1.0 - abs(place - taus_s.index(tau_s))))
 
 
 def _summarize(structure: Floats) -> GaussMarkov:
-    """Return the process whose structure function is nearest to one at `_SUMMARY_S`, in the logarithm."""
+    """Return the process whose structure function is nearest to a given one at `_SUMMARY_S`, in the logarithm."""
     if not (structure > 0.0).all():
         return _NO_PROCESS
     shape = -2.0 * np.expm1(-_SUMMARY_S / _SUMMARY_TAU_S[:, None])
@@ -358,7 +358,7 @@ def _summarize(structure: Floats) -> GaussMarkov:
 
 
 def make_prior_model(measurements: Measurements) -> NoiseModel:
-    """Return the noise by priors and claims alone."""
+    """Return the noise from priors and claims alone."""
     gnss, imu = measurements.gnss, [IMU] if measurements.imu is not None else []
     return NoiseModel(
         horizontal=None if gnss is None else _make_fix_prior(gnss, slice(0, 2)),
@@ -385,9 +385,9 @@ def make_prior_model(measurements: Measurements) -> NoiseModel:
 
 
 def _make_fix_prior(gnss: Positions, axes: slice) -> SensorNoise:
-    """Return the noise of fixes whose claims are right in total."""
+    """Return the prior noise of fixes: white noise and process together have the claimed variance."""
     claimed = float(np.median(gnss.variance_m2[:, axes]))
-    if claimed >= NO_TRUST:  # not measured: there is no error that lasts, which would be kilometres
+    if claimed >= MAX_VARIANCE:  # not measured: a correlated error would be kilometres large
         return SensorNoise(claimed, _NO_PROCESS, claimed)
     prior = PRIORS["fix, centimetres" if claimed < _CENTIMETRES_M2 else "fix, more"]
     return SensorNoise((1.0 - prior.variance) * claimed, GaussMarkov(prior.variance * claimed, prior.time_s), claimed)
@@ -398,6 +398,6 @@ def _compute_density(stamp_ns: Ints, values: Floats) -> float:
     finite = np.isfinite(values)
     second = np.abs(np.diff(values[finite], n=2))
     second = second[second > 0.0]
-    if second.size < _FEWEST:
+    if second.size < _MIN_ROWS:
         return 0.0
     return estimate_robust_std(second) ** 2 / 6.0 * compute_median_period_ns(stamp_ns[finite]) * 1e-9

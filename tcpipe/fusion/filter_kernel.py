@@ -1,10 +1,10 @@
 """Forward pass of the error-state unscented filter over ticks of the track; the smoother: `smoother_kernel`.
 
-Means pass through motion and measurements at the centre. Covariances pass through sigma points of the errors on which
-each depends, drawn anew from their marginal covariance: with ``P_s = L L'``, the points ``x ± √3 L_i`` give the linear
-map ``F`` that fits the function best and, as additional noise, what that map misses::
+The function of the central state gives the mean. Sigma points give the covariance: they cover only the errors on which
+the function depends, with their marginal covariance. With ``P_s = L L'``, the points ``x ± √3 L_i`` give the linear map
+``F`` that fits the function best, and the misfit of that map as additional noise::
 
-    F L_i = (f(x + √3 L_i) - f(x - √3 L_i)) / 2√3        missed: Σ e_i e_i' / 3,  e_i = (f(x + √3 L_i) + f(x - √3 L_i)) / 2 - f(x)
+    F L_i = (f(x + √3 L_i) - f(x - √3 L_i)) / 2√3        misfit: Σ e_i e_i' / 3,  e_i = (f(x + √3 L_i) + f(x - √3 L_i)) / 2 - f(x)
 
 Reference: M. Brossard et al., "A code for unscented Kalman filtering on manifolds (UKF-M)", ICRA 2020.
 """
@@ -40,34 +40,34 @@ from tcpipe.fusion.state import (
 
 
 class GateVerdict(IntEnum):
-    """Verdicts of the gate. RESET: rejected for so long that the state is taken to be wrong, not the sensor."""
+    """Verdicts of the gate. RESET: rejections lasted so long that the state is assumed wrong, not the sensor."""
 
     NONE, ACCEPTED, REJECTED, RESET = range(4)
 
 
 RESET_REJECTIONS, RESET_SPEED_STD_MPS = 5, 0.3
-"""Least rejections in a row before a reset [1], and σ of the velocity after it, as at the start [m/s]."""
+"""Fewest consecutive rejections before a reset [1], and σ of the velocity after it, as at the start [m/s]."""
 
 Indices = NDArray[np.int64]
 
 
 class TickInputs(NamedTuple):
-    """All that a section measures, by tick k of K; see `tcpipe.fusion.ticks`.
+    """All measurements of a section, by tick k of K; see `tcpipe.fusion.ticks`.
 
     Attributes
     ----------
-    period_s : time of a tick [s].
-    mode, turned, gained : motion from the tick before, as `move_state` takes it, (K,), (K, 9), (K, 6).
+    period_s : time between ticks [s].
+    mode, turned, gained : motion since the tick before, see `move_state`, (K,), (K, 9), (K, 6).
     noise : variance added to rotation and body velocity [rad², m²/s²], (K, 6).
-    rate, has_gyro : angular velocity at the tick, as measured [rad/s], (K, 3), and whether by a gyroscope, (K,).
-    acceleration : of the body, forward, at the tick [m/s²], (K,). Not the state's own, whose noise would look like a
-    lag of every sensor.
-    value, variance : measurements by kind, (K, 9, 3); NaN: none. Of the attitude of a pose zero: it is measured from
-    ``attitude``.
+    rate, has_gyro : measured angular velocity at the tick [rad/s], (K, 3), and whether a gyroscope measured it, (K,).
+    acceleration : forward acceleration of the body at the tick [m/s²], (K,), from sensors. The acceleration of the
+    state is too noisy: its noise would act as a delay of every sensor.
+    value, variance : measurements by kind, (K, 9, 3); NaN: none. The value of an attitude is zero: it is a rotation
+    from ``attitude``.
     tau : time of the measurement after the tick [s], (K, 9).
-    levers : places of odometries on the robot [m], (9, 3).
-    fix_kept, fix_noise : share of the fixes' correlated error that stays since the tick before (K,), and variance added
-    to it [m²], (K, 3).
+    levers : lever arms of odometries [m], (9, 3).
+    fix_kept, fix_noise : decay factor of the fixes' correlated error since the tick before, (K,), and variance added to
+    that error [m²], (K, 3).
     attitude : rotation vector of a pose's attitude, enu_from_robot [rad], (K, 3).
     """
 
@@ -94,14 +94,14 @@ class FilterModel(NamedTuple):
     Attributes
     ----------
     active : errors that are not known exactly, in order, (n,).
-    depends : by kind of measurement, and then motion by odometry and by gyroscope, the places in ``active`` of the
-        errors on which it depends, (11, n), of which the first ``counts`` (11,) are used.
-    kept, noise : share that stays of each error over a tick, and variance added, (n,).
+    depends : for each kind of measurement, then motion by odometry and by gyroscope: indices in ``active`` of the
+        errors on which it depends, (11, n); only the first ``counts`` (11,) are valid.
+    kept, noise : decay factor of each error over a tick, and variance added, (n,).
     gates : largest squared normalised innovation by kind; infinite: no gate.
     patience_s : by kind, time since the last accepted measurement after which one is accepted [s], (9,).
-    mount : place of the IMU's mounting in ``active``; -1: known exactly.
-    events : changes of errors: (tick, place in ``active``, whether the error is another one now); (e, 3).
-    sizes, shifts : variance that each event adds, and by how much it changes the error, (e,).
+    mount : index of the IMU's mounting in ``active``; -1: known exactly.
+    events : changes of errors: (tick, index in ``active``, whether the error is drawn anew), (e, 3).
+    sizes, shifts : variance that each event adds, and mean change of the error, (e,).
     """
 
     active: Indices
@@ -134,7 +134,7 @@ class Memory(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Inputs of the smoother for B ticks: motion F, kept shares, updates by kind (K, H, S⁻¹ y, S⁻¹, turn), last x, P."""
+    """Inputs of the smoother, B ticks: motion F, decay factors, updates by kind (K, H, S⁻¹ y, S⁻¹, turn), last x, P."""
 
     F: Floats
     kept: Matrix
@@ -157,13 +157,12 @@ class Tests(NamedTuple):
     fix_innovation: Matrix
 
 
-MOST = MOVING + 1
-"""Errors on which motion depends, at most."""
+MOST = MOVING + 1  # largest number of errors on which motion depends
 _SPREAD = sqrt(3.0)  # matches the fourth moment of a normal distribution
 
 
 def allocate_steps(ticks: int, n: int) -> Steps:
-    """Return room for what the smoother needs of so many ticks."""
+    """Return empty arrays for the inputs of the smoother over this many ticks."""
     return Steps(
         np.zeros((ticks, MOST, MOST)),
         np.ones((ticks, n)),
@@ -179,15 +178,15 @@ def allocate_steps(ticks: int, n: int) -> Steps:
 
 
 @compile_kernel
-def factorize(P: Matrix, places: Indices, m: int, L: Matrix) -> None:
-    """Fill L with the lower Cholesky factor of P at m places; a pivot that rounding has spoiled is lifted."""
+def factorize(P: Matrix, indices: Indices, m: int, L: Matrix) -> None:
+    """Fill L with the lower Cholesky factor of P at m indices; pivots that rounding made too small are raised."""
     for i in range(m):
         for j in range(i + 1):
-            s = P[places[i], places[j]]
+            s = P[indices[i], indices[j]]
             for k in range(j):
                 s -= L[i, k] * L[j, k]
             if i == j:
-                L[i, i] = sqrt(max(s, 1e-14 * P[places[i], places[i]] + 1e-300))
+                L[i, i] = sqrt(max(s, 1e-14 * P[indices[i], indices[i]] + 1e-300))
             else:
                 L[i, j] = s / L[j, j]
 
@@ -204,25 +203,25 @@ def _solve_for_map(M: Matrix, rows: int, L: Matrix, m: int, F: Matrix) -> None:
 
 
 @compile_kernel
-def _draw_sigma_point(i: int, m: int, active: Indices, places: Indices, L: Matrix, d: Vector) -> None:
-    """Fill d with the errors of the i-th sigma point: √3 times a column of the factor of P at m places."""
+def _draw_sigma_point(i: int, m: int, active: Indices, indices: Indices, L: Matrix, d: Vector) -> None:
+    """Fill d with the errors of the i-th sigma point: √3 times a column of the factor of P at m indices."""
     d[:] = 0.0
     for r in range(i, m):
-        d[active[places[r]]] = _SPREAD * L[r, i]
+        d[active[indices[r]]] = _SPREAD * L[r, i]
 
 
 @compile_kernel
 def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, F: Matrix, room: Any) -> None:
-    """Carry x and P over the motion of tick k; F becomes the map of the errors on which it depends."""
+    """Propagate x and P over the motion of tick k; F becomes the map of the errors on which the motion depends."""
     L, M, W, missed, d, high, low, centre, turn, up, down = room
     mode = inputs.mode[k]
     row = KINDS + (mode >= Mode.GYRO_TURN)
-    places, m, n = model.depends[row], model.counts[row], P.shape[0]
+    indices, m, n = model.depends[row], model.counts[row], P.shape[0]
     move_state(x, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], centre, turn)
-    factorize(P, places, m, L)
+    factorize(P, indices, m, L)
     missed[:] = 0.0
     for i in range(m):
-        _draw_sigma_point(i, m, model.active, places, L, d)
+        _draw_sigma_point(i, m, model.active, indices, L, d)
         displace_state(x, d, 1.0, low, turn)
         move_state(low, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], high, turn)
         compute_moving_error(high, centre, up)
@@ -230,7 +229,7 @@ def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, 
         move_state(low, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], high, turn)
         compute_moving_error(high, centre, down)
         for a in range(m):
-            e = model.active[places[a]]
+            e = model.active[indices[a]]
             if e < MOVING:
                 M[a, i] = 0.5 / _SPREAD * (up[e] - down[e])
                 d[e] = 0.5 * (up[e] + down[e])
@@ -239,25 +238,25 @@ def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, 
                 d[e] = 0.0
         for a in range(m):
             for b in range(m):
-                missed[a, b] += d[model.active[places[a]]] * d[model.active[places[b]]] / 3.0
+                missed[a, b] += d[model.active[indices[a]]] * d[model.active[indices[b]]] / 3.0
     _solve_for_map(M, m, L, m, F)
     for a in range(m):
         W[a] = 0.0
         for b in range(m):
             f = F[a, b]
-            line = P[places[b]]
+            line = P[indices[b]]
             for j in range(n):
                 W[a, j] += f * line[j]
     for a in range(m):
-        P[places[a]] = W[a]
-        P[:, places[a]] = W[a]
+        P[indices[a]] = W[a]
+        P[:, indices[a]] = W[a]
     for a in range(m):
         for b in range(a + 1):
             s = missed[a, b]
             for c in range(m):
-                s += W[a, places[c]] * F[b, c]
-            P[places[a], places[b]] = s
-            P[places[b], places[a]] = s
+                s += W[a, indices[c]] * F[b, c]
+            P[indices[a], indices[b]] = s
+            P[indices[b], indices[a]] = s
     x[:] = centre
     for e in range(3):  # rotation and velocity are always active, and first
         P[Error.THETA + e, Error.THETA + e] += inputs.noise[k, e]
@@ -266,7 +265,7 @@ def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, 
 
 @compile_kernel
 def _decay(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, kept: Vector) -> None:
-    """Apply decay, walk and events of parameters to tick k; ``kept`` becomes the remaining share of each error."""
+    """Apply decay, random walk and events of parameters at tick k; ``kept`` becomes the decay factor of each error."""
     n = P.shape[0]
     for i in range(n):
         is_fix_error = Error.FIX_ERROR <= model.active[i] < Error.FIX_ERROR + 3
@@ -305,16 +304,16 @@ def _compare(
     """Fill innovation, H, P H', S and S⁻¹ of one measurement; return log det S."""
     y, H, Hs, cross, S, inverse = gain
     L, M, missed, d, high, turn, up, down = room[0], room[1], room[3], room[4], room[5], room[8], room[9], room[10]
-    places, m, size, n = model.depends[kind], model.counts[kind], SIZES[kind], P.shape[0]
+    indices, m, size, n = model.depends[kind], model.counts[kind], SIZES[kind], P.shape[0]
     rate, gyro, tau = inputs.rate[k], inputs.has_gyro[k], inputs.tau[k, kind]
     lever = inputs.attitude[k] if kind == Kind.ATTITUDE else inputs.levers[kind]
     centre = S[0]
     predict_measurement(kind, x, rate, gyro, acceleration, tau, lever, centre)
     y[:] = centre
-    factorize(P, places, m, L)
+    factorize(P, indices, m, L)
     missed[:3, :3] = 0.0
     for i in range(m):
-        _draw_sigma_point(i, m, model.active, places, L, d)
+        _draw_sigma_point(i, m, model.active, indices, L, d)
         displace_state(x, d, 1.0, high, turn)
         predict_measurement(kind, high, rate, gyro, acceleration, tau, lever, up)
         displace_state(x, d, -1.0, high, turn)
@@ -323,7 +322,7 @@ def _compare(
             M[a, i] = 0.5 / _SPREAD * (up[a] - down[a])
             for b in range(a + 1):
                 missed[a, b] += (0.5 * (up[a] + down[a]) - y[a]) * (0.5 * (up[b] + down[b]) - y[b]) / 3.0
-    if kind == Kind.FIX:  # the product of the errors of yaw and of the distance driven since the last fix is sideways
+    if kind == Kind.FIX:  # error of yaw times error of distance since the last fix: sideways
         for a in range(3):
             for b in range(3):
                 missed[a, b] += (
@@ -334,15 +333,15 @@ def _compare(
         H[a], cross[a] = 0.0, 0.0
         for i in range(m):
             h = Hs[a, i]
-            H[a, places[i]] = h
-            line = P[places[i]]
+            H[a, indices[i]] = h
+            line = P[indices[i]]
             for j in range(n):
                 cross[a, j] += h * line[j]
     for a in range(size):
         for b in range(a + 1):
             s = missed[a, b]
             for i in range(m):
-                s += Hs[b, i] * cross[a, places[i]]
+                s += Hs[b, i] * cross[a, indices[i]]
             S[a, b] = s
             S[b, a] = s
         S[a, a] += inputs.variance[k, kind, a]
@@ -388,9 +387,9 @@ def _compute_nis(y: Vector, inverse: Matrix, size: int) -> float:
 
 @compile_kernel
 def _make_turn(a: float, b: float, c: float, out: Vector) -> None:
-    """Fill ``out`` with how rotation errors, and then position errors, change axes after a correction by (a, b, c).
+    """Fill ``out`` with the rotations of the axes of rotation and position errors by a correction (a, b, c).
 
-    The right Jacobian of SO(3) to second order (Solà 2017, eq. 183), and the inverse rotation.
+    These are the right Jacobian of SO(3) to second order (Solà 2017, eq. 183), and the inverse rotation.
     """
     make_rotation(-a, -b, -c, out[9:])
     make_rotation(-0.5 * a, -0.5 * b, -0.5 * c, out)
@@ -412,7 +411,7 @@ def turn_rows(A: Matrix, turn: Vector, columns: int, transposed: bool) -> None:
 
 @compile_kernel
 def _correct(x: Vector, P: Matrix, active: Indices, size: int, gain: Any, K: Matrix, turn: Vector, room: Any) -> None:
-    """Correct x and P by what `_compare` has left; K' and the turn of the axes are kept."""
+    """Correct x and P by the result of `_compare`; fill K' and the rotation of the axes."""
     y, _, _, cross, _, inverse = gain
     d, high, small = room[4], room[5], room[8]
     n = P.shape[0]
@@ -451,13 +450,13 @@ def filter_ticks(
     steps: Steps,
     tests: Tests,
 ) -> None:
-    """Filter ticks ``first`` to ``last``, the latter excluded; ``memory`` becomes that after them.
+    """Filter ticks ``first`` to ``last``, the latter excluded; ``memory`` becomes the state after them.
 
     Parameters
     ----------
-    inputs, model : see there.
-    memory : state before ``first``: at tick ``first - 1``, or at ``first`` where that is 0.
-    steps : filled, unless there is room for none; tick k has row ``k - first``.
+    inputs, model : see `TickInputs`, `FilterModel`.
+    memory : state at tick ``first - 1``, or at tick 0 if ``first`` is 0.
+    steps : filled, unless it is empty; tick k has row ``k - first``.
     tests : filled for these ticks.
     """
     x, P, waits = memory

@@ -1,12 +1,12 @@
-"""Where a section starts: position, attitude and gyroscope bias, found offline from all that follows.
+"""State at the start of a section: position, attitude and gyroscope bias, from all later measurements.
 
-Yaw and position come from the track of an odometry that is aligned with the fixes (`tcpipe.fusion.level_motion`): since
-the odometry's velocity has a sign, a run may start in reverse, and with a turn. Roll and pitch come from the specific
-force.
+Yaw and position come from the track of an odometry that is aligned with the fixes (`tcpipe.fusion.level_motion`). Since
+the odometry's velocity has a sign, a run may start with reverse driving or with a turn. Roll and pitch come from the
+specific force.
 
-The robot is stationary where the wheels do not turn and the gyroscope is quiet; wheels at rest on a robot that slides,
-or a gyroscope at rest on a straight, are not enough. It gives two more measurements (zero velocity, and the gyroscope's
-bias) and the initial bias.
+The robot is stationary where the wheels do not turn and the gyroscope measures no rotation. Both are needed: wheels may
+stand on a robot that slides, and a gyroscope measures no rotation on a straight line. A stop gives two more
+measurements (zero velocity, and the gyroscope's bias) and the initial bias.
 """
 
 from __future__ import annotations
@@ -26,28 +26,31 @@ from tcpipe.fusion.signals import (
     compute_slopes,
     compute_window_means,
     interpolate_signal,
-    remove_wild_places,
+    remove_xy_spikes,
 )
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
-_UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
+_UNKNOWN_YAW_STD_RAD = 0.6  # sigma points of a larger σ would wrap around
 
 
 def find_initial_state(measurements: Measurements, stationary_ns: Ints, start_ns: int) -> InitialState:
-    """Return the state at ``start_ns`` [ns], the first stamp of a section; ``stationary_ns`` [ns], (K, 2): stops."""
+    """Return the state at ``start_ns`` [ns], the first stamp of a section.
+
+    ``stationary_ns`` [ns], shape (K, 2), are first and last stamps of stops.
+    """
     bias, bias_std = _estimate_gyro_bias(measurements.imu, stationary_ns)
     roll, pitch, tilt_std = _estimate_tilt(measurements.imu, stationary_ns, start_ns)
     m, has_odometry = measurements, bool(measurements.odometries())
     if m.imu is not None:
         m = replace(m, imu=replace(m.imu, angular_velocity_radps=m.imu.angular_velocity_radps - bias))
-    if m.gnss is not None and not m.is_antenna_alone and not has_odometry:  # it drives forward
-        m = replace(m, wheels=_read_speeds(m.gnss))
+    if m.gnss is not None and not m.is_antenna_alone and not has_odometry:  # assume that it drives forward
+        m = replace(m, wheels=_make_fix_odometry(m.gnss))
     motion = find_level_motion(m)
     track = next(iter(motion.tracks.values()), None) if motion is not None else None
     yaw, yaw_std, heading_from = _estimate_yaw(m, motion, track, start_ns, bias_std)
     quat = quat_from_rpy(roll, pitch, yaw)
     position, position_std = _estimate_position(m.gnss, motion, track, quat, start_ns)
-    velocity, velocity_std = np.zeros(3), 2.0  # m/s: no sensor shows it
+    velocity, velocity_std = np.zeros(3), 2.0  # m/s: no sensor measures it
     if m.first_odometry is not None:
         along = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
         velocity = float(np.median(m.first_odometry.velocity_mps[:5, 0])) * along
@@ -86,9 +89,12 @@ def _estimate_tilt(imu: InertialMeasurements | None, stationary_ns: Ints, start_
     return roll, pitch, 0.03 if stands else 0.08
 
 
-def _read_speeds(gnss: Positions) -> BodyVelocities:
-    """Return how fast fixes move, as the odometry of a robot that drives forward."""
-    places, window_s = remove_wild_places(gnss.position_enu_m), max(1.0, 3e-9 * compute_median_period_ns(gnss.stamp_ns))
+def _make_fix_odometry(gnss: Positions) -> BodyVelocities:
+    """Return the speed of fixes as an odometry of a robot that drives forward."""
+    places, window_s = (
+        remove_xy_spikes(gnss.position_enu_m),
+        max(1.0, 3e-9 * compute_median_period_ns(gnss.stamp_ns)),
+    )
     velocity, unknown = np.full((2, places.size, 3), np.nan)
     velocity[:, 0] = np.hypot(*(compute_slopes(gnss.stamp_ns, axis, window_s) for axis in (places.real, places.imag)))
     return BodyVelocities(gnss.stamp_ns, velocity, unknown, unknown[:, 0])
@@ -112,7 +118,7 @@ def _estimate_yaw(
         std = float(np.hypot(np.hypot(track.heading_std_rad, 0.03), bias_std * shown_s))
         return float(track.heading_rad[0]), min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
     posed = np.flatnonzero(np.isfinite(gnss.quat_xyzw).all(1))[:1] if gnss.quat_xyzw is not None else np.empty(0, int)
-    if gnss.quat_xyzw is not None and posed.size:  # the first attitude of a pose, less what the robot turned until then
+    if gnss.quat_xyzw is not None and posed.size:  # first attitude of a pose, less the turn until then
         at_s, turned = compute_seconds(gnss.stamp_ns[posed], start_ns), 0.0
         if motion is not None:
             turned = float(np.interp(at_s, motion.attitude.time_s, motion.attitude.yaw_rad)[0])
@@ -123,7 +129,7 @@ def _estimate_yaw(
 def _estimate_position(
     gnss: Positions | None, motion: LevelMotion | None, track: OdometryTrack | None, quat: Floats, start_ns: int
 ) -> tuple[Floats, Floats]:
-    """Return base_link at the start and its σ: the median of the first fixes less the displacement since the start."""
+    """Return base_link at the start and its σ: the median of the first fixes minus the displacement since the start."""
     if gnss is None:
         return np.zeros(3), np.full(3, 1e-3)
     few = slice(0, int(np.clip(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[0] + 1_000_000_000, "right"), 3, 10)))
@@ -137,7 +143,7 @@ def _estimate_position(
         driven_m = STEP_S * float(np.abs(track.speed_mps[grid_s < at_s[-1]]).sum())
     off = gnss.position_enu_m[few] - antenna_m
     std: Floats = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
-    if not gnss.has_heights:  # they count from the start: σ of kilometres would act on the plane by every tilt
+    if not gnss.has_heights:  # heights count from the start: a σ of kilometres would disturb the plane by tilt
         std[2] = 0.0
     position: Floats = np.median(off, axis=0)
     return position, std + np.array([0.1, 0.1, 0.2]) * max(driven_m, 1.0) + np.ptp(off, axis=0)
@@ -147,7 +153,7 @@ _WINDOW_NS = 500_000_000  # window of means and scatter
 
 
 def find_stationary_intervals(measurements: Measurements) -> Ints:
-    """Return certain stops: first and last stamp of each stop of at least 0.3 s [ns], shape (K, 2), sorted.
+    """Return reliably detected stops of at least 0.3 s: first and last stamp [ns], shape (K, 2), sorted.
 
     Empty without wheels or without gyroscope.
     """
@@ -155,27 +161,30 @@ def find_stationary_intervals(measurements: Measurements) -> Ints:
     if wheels is None or imu is None:
         return np.empty((0, 2), np.int64)
     stamp = wheels.stamp_ns
-    # Clipped, so that a single wild sample does not wake the robot.
+    # Clipped, so that a single outlier does not end a stop.
     clipped = np.clip(wheels.velocity_mps[:, :1], -0.2, 0.2)
     still = _is_steady(stamp, stamp, clipped, 0.02, 0.06)  # m/s: encoders at rest
-    quiet_radps = max(0.012, 4 * imu.gyro_std_radps)  # noise at rest [rad/s]; judged
-    still &= _is_steady(stamp, imu.stamp_ns, imu.angular_velocity_radps, 0.05, quiet_radps)  # a bias is less
-    return _find_intervals(stamp, still)
+    quiet_radps = max(0.012, 4 * imu.gyro_std_radps)  # noise at rest [rad/s]; by judgement
+    still &= _is_steady(stamp, imu.stamp_ns, imu.angular_velocity_radps, 0.05, quiet_radps)  # larger than any bias
+    return _find_stops(stamp, still)
 
 
-def _is_steady(at_ns: Ints, stamp_ns: Ints, values: Floats, largest: float, spread: float) -> Mask:
+def _is_steady(at_ns: Ints, stamp_ns: Ints, values: Floats, largest: float, largest_std: float) -> Mask:
     """Return whether mean and standard deviation of samples (N, k) around each stamp are small."""
     mean, square = (compute_window_means(stamp_ns, each, at_ns, _WINDOW_NS) for each in (values, values**2))
-    small: Mask = (np.abs(mean) < largest) & (np.sqrt(np.maximum(square - mean**2, 0.0)) < spread)
+    small: Mask = (np.abs(mean) < largest) & (np.sqrt(np.maximum(square - mean**2, 0.0)) < largest_std)
     return np.asarray(small.all(axis=1))
 
 
-def _find_intervals(stamp_ns: Ints, still: Mask) -> Ints:
-    """Return the runs of True, shape (K, 2), without short ones; gaps of half a second end them, and ends are cut."""
-    joined = still[1:] & still[:-1] & (np.diff(stamp_ns) < _WINDOW_NS)
-    first = np.flatnonzero(still & ~np.concatenate(([False], joined)))
-    last = np.flatnonzero(still & ~np.concatenate((joined, [False])))
-    found = np.stack((stamp_ns[first], stamp_ns[last]), -1)
-    # Shorter stops do not count; the robot rocks at both ends.
-    inner: Ints = found[found[:, 1] - found[:, 0] >= 600_000_000] + np.array([150_000_000, -150_000_000])
+def _find_stops(stamp_ns: Ints, still: Mask) -> Ints:
+    """Return first and last stamp [ns] of each stop, shape (K, 2), cut by 0.15 s at both ends.
+
+    A gap of half a second ends a stop. Stops shorter than 0.6 s are left out.
+    """
+    is_continued = still[1:] & still[:-1] & (np.diff(stamp_ns) < _WINDOW_NS)
+    first = np.flatnonzero(still & ~np.concatenate(([False], is_continued)))
+    last = np.flatnonzero(still & ~np.concatenate((is_continued, [False])))
+    stops_ns = np.stack((stamp_ns[first], stamp_ns[last]), -1)
+    # The robot rocks at both ends of a stop.
+    inner: Ints = stops_ns[stops_ns[:, 1] - stops_ns[:, 0] >= 600_000_000] + np.array([150_000_000, -150_000_000])
     return inner

@@ -1,10 +1,10 @@
-"""How the body moved by one odometry and the turn rates, in a level frame, aligned robustly with the fixes.
+"""Motion of the body from one odometry and turn rates, in a level frame, aligned robustly with the fixes.
 
-Attitude is dead reckoning: the gyroscope's increments multiplied, in a frame that drifts. Up in that frame is the
-specific force averaged over seconds, less the accelerations of the odometry; heading is the direction of the body's
-x-axis about it, and wanders with the gyroscope. The alignment takes out what a filter estimates anyhow: the odometry's
-scale, the heading's slow drift, an error of the antenna's lever arm and a time offset, by iterated least squares with
-weights that fall with the square of a residual (Cauchy's loss).
+Attitude is dead reckoning: the product of the gyroscope's increments, in a frame that drifts. The up direction in that
+frame is the specific force averaged over seconds, less the accelerations of the odometry. Heading is the direction of
+the body's x-axis about it, and drifts with the gyroscope. The alignment estimates the odometry's scale, the slow drift
+of heading, an error of the antenna's lever arm and a time offset, by iterated least squares with weights that fall with
+the square of a residual (Cauchy's loss).
 """
 
 from __future__ import annotations
@@ -32,12 +32,10 @@ from tcpipe.geometry.rotation import matrix_from_quat, multiply, normalize, quat
 
 _Number = TypeVar("_Number", np.float64, np.complex128)
 
-COURSE = "course over ground"
-"""Source of the yaw rate where no sensor measures it."""
-STEP_S, KNOT_S = 0.05, 60.0
-"""Steps of the grid of times, and between knots of the drift of heading [s]."""
-_ROUNDS, _FEWEST = 8, 4
-"""Rounds of weighted least squares, and samples or windows that show a turn or a heading [1] (rulings)."""
+COURSE = "course over ground"  # source of the yaw rate if no sensor measures it
+STEP_S, KNOT_S = 0.05, 60.0  # step of the time grid, and time between knots of the heading drift [s]
+_ROUNDS, _MIN_COUNT = 8, 4
+"""Rounds of weighted least squares, and fewest samples or windows for a turn or heading [1] (by judgement)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +73,13 @@ def get_turn_rates(measurements: Measurements, role: str) -> tuple[Ints, Floats]
 
 
 def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Attitude | None:
-    """Return the attitude from ``zero_ns`` on; None where no sensor shows turns."""
+    """Return the attitude from ``zero_ns`` to ``end_s``; None if no sensor measures turns."""
     imu = measurements.imu
-    # Slower IMUs show no turns [ns].
-    shows = imu is not None and imu.stamp_ns.size >= _FEWEST and compute_median_period_ns(imu.stamp_ns) <= 100_000_000
-    role = IMU if shows else next(reversed(measurements.turning_odometries()), COURSE)
+    # Slower IMUs do not resolve turns [ns].
+    is_imu_usable = (
+        imu is not None and imu.stamp_ns.size >= _MIN_COUNT and compute_median_period_ns(imu.stamp_ns) <= 100_000_000
+    )
+    role = IMU if is_imu_usable else next(reversed(measurements.turning_odometries()), COURSE)
     if end_s < 2 * STEP_S or (role == COURSE and measurements.gnss is None):
         return None
     time_s = np.arange(0.0, end_s + STEP_S, STEP_S)
@@ -90,10 +90,10 @@ def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Att
         yaw = integrate_grid(rate[:, 2])
         rotation = matrix_from_quat(quat_from_rpy(0.0 * yaw, 0.0 * yaw, yaw))
         return Attitude(time_s, rotation, yaw, rate, role, stamp_ns, is_level=False)
-    force = _mean_force(measurements, imu, zero_ns, time_s, rate)
+    force = _average_force(measurements, imu, zero_ns, time_s, rate)
     quat = _multiply_increments(rate[:-1] * STEP_S)
     up = _find_up(quat, force)
-    # "Up" turns in the drifting frame by the gyroscope's bias about the level axes.
+    # The gyroscope's bias about the level axes rotates the up direction in the drifting frame.
     turn = np.cross(up, np.gradient(up, STEP_S, axis=0))
     bias = np.median(np.einsum("nji,nj->ni", matrix_from_quat(quat), turn), axis=0)
     quat = _multiply_increments((rate[:-1] - bias) * STEP_S)
@@ -103,10 +103,10 @@ def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Att
     return Attitude(time_s, rotation, yaw, rate - bias, IMU, stamp_ns, is_level=True)
 
 
-def _mean_force(
+def _average_force(
     measurements: Measurements, imu: InertialMeasurements, zero_ns: int, time_s: Floats, rate: Floats
 ) -> Floats:
-    """Return the specific force less the acceleration of an odometry, (n, 3)."""
+    """Return the specific force minus the acceleration of an odometry, (n, 3)."""
     means = compute_interval_means(
         compute_seconds(imu.stamp_ns, zero_ns), imu.specific_force_mps2, time_s - 0.5 * STEP_S, time_s + 0.5 * STEP_S
     )
@@ -120,12 +120,12 @@ def _mean_force(
 
 
 def average_grid(values: Floats, window_s: float) -> Floats:
-    """Return the centred moving mean over a window, along the first axis; shorter at the ends."""
+    """Return the centred moving mean over a window, along the first axis; windows are shorter at the ends."""
     return compute_moving_mean(values, max(1, round(0.5 * window_s / STEP_S)), least=0.0)
 
 
 def _multiply_increments(turn_rad: Floats) -> Floats:
-    """Return the products of rotation vectors (n, 3) from the first on, (n + 1, 4): a prefix scan by doubling."""
+    """Return cumulative products of rotation vectors (n, 3), quaternions (n + 1, 4): a prefix scan by doubling."""
     quat = np.concatenate(([[0.0, 0.0, 0.0, 1.0]], quat_from_rotation_vector(turn_rad)))
     step = 1
     while step < len(quat):
@@ -153,11 +153,11 @@ class OdometryTrack:
 
     Attributes
     ----------
-    speed_mps : (n,) horizontal, forward positive; scaled as the fixes say.
-    heading_rad : (n,) of base_link's x-axis, from east where there are fixes.
-    path_m : (n, 3) of base_link, from zero on; east, north, up where there are fixes.
-    arm_m : (n, 3) the antenna from base_link in the same axes, with what a time offset of the fixes adds.
-    heading_std_rad : standard deviation of the heading by the fixes.
+    speed_mps : (n,) horizontal, forward positive, scaled to the fixes.
+    heading_rad : (n,) of base_link's x-axis; zero is east if there are fixes.
+    path_m : (n, 3) of base_link, starting at zero; east, north, up if there are fixes.
+    arm_m : (n, 3) antenna from base_link in the same axes, plus the displacement by a time offset of the fixes.
+    heading_std_rad : standard deviation of the heading from the fixes.
     """
 
     speed_mps: Floats
@@ -177,29 +177,29 @@ def compute_forward_mps(source: BodyVelocities, attitude: Attitude, zero_ns: int
 
 
 def integrate_grid(rate: NDArray[_Number]) -> NDArray[_Number]:
-    """Return the integral from zero on over a grid of `STEP_S` of samples (n,) or (n, k)."""
+    """Return the integral of samples (n,) or (n, k) over a grid of `STEP_S`, starting at zero."""
     total = np.zeros_like(rate)
     np.cumsum(0.5 * (rate[1:] + rate[:-1]) * STEP_S, axis=0, out=total[1:])
     return total
 
 
 def make_free_track(forward_mps: Floats, attitude: Attitude) -> OdometryTrack:
-    """Return a track in the level frame, aligned with nothing."""
+    """Return a track in the level frame, without alignment to fixes."""
     path = integrate_grid(forward_mps[:, None] * attitude.rotation[:, :, 0])
-    level = np.hypot(attitude.rotation[:, 0, 0], attitude.rotation[:, 1, 0])
-    return OdometryTrack(forward_mps * level, attitude.yaw_rad, path, np.zeros_like(path))
+    horizontal_mps = np.hypot(attitude.rotation[:, 0, 0], attitude.rotation[:, 1, 0])
+    return OdometryTrack(forward_mps * horizontal_mps, attitude.yaw_rad, path, np.zeros_like(path))
 
 
 @dataclass(frozen=True, slots=True)
 class LevelMotion:
-    """Motion of a section by its odometries and turns.
+    """Motion of a section from its odometries and turn rates.
 
     Attributes
     ----------
     zero_ns : zero of all times [ns]: the first measurement of fixes or odometries.
     attitude : on the grid.
     forward_mps : by odometry, base_link's forward velocity on the grid, (n,).
-    tracks : by odometry, aligned with the fixes; none where these show no motion.
+    tracks : by odometry, aligned with the fixes; empty if the fixes do not move.
     """
 
     zero_ns: int
@@ -209,7 +209,7 @@ class LevelMotion:
 
 
 def find_level_motion(measurements: Measurements) -> LevelMotion | None:
-    """Return how the body moved; None without odometry, or where nothing shows turns."""
+    """Return the motion of the body; None without odometry or turn rates."""
     odometries, gnss = measurements.odometries(), measurements.gnss
     stamps = [each.stamp_ns for each in odometries.values()] + ([] if gnss is None else [gnss.stamp_ns])
     zero_ns = min((int(stamp_ns[0]) for stamp_ns in stamps), default=0)
@@ -225,10 +225,10 @@ def find_level_motion(measurements: Measurements) -> LevelMotion | None:
 def align_tracks(
     forward_mps: Mapping[str, Floats], gnss: Positions, attitude: Attitude, zero_ns: int
 ) -> dict[str, OdometryTrack]:
-    """Return the tracks of odometries in the frame of the fixes; none where the fixes show no motion.
+    """Return the tracks of odometries in the frame of the fixes; empty if the fixes do not move.
 
-    Heading, arm and time offset of the odometry that follows the fixes best also hold for the others; each has its own
-    scale.
+    Heading, lever arm and time offset come from the odometry that fits the fixes best, also for the others; each has
+    its own scale.
     """
     alignment = _Alignment(gnss, attitude, zero_ns)
     fits = {role: fit for role, forward in forward_mps.items() if (fit := alignment.fit(forward)) is not None}
@@ -238,7 +238,7 @@ def align_tracks(
     return {
         role: alignment.make_track(forward_mps[role], replace(best, scale=fit.scale))
         for role, fit in fits.items()
-        if fit.scale > 0.2  # else it shows another motion
+        if fit.scale > 0.2  # else it measures another motion
     }
 
 
@@ -246,7 +246,7 @@ def align_tracks(
 class _Fit:
     """Transformation of a dead-reckoned track to fixes.
 
-    ``turn_rad`` (n,) on the grid; ``noise_m``: median residual; ``turn_std_rad``: what it makes of a window's heading.
+    ``turn_rad`` (n,) on the grid; ``noise_m``: median residual; ``turn_std_rad``: σ of a window's heading.
     """
 
     turn_rad: Floats
@@ -265,13 +265,13 @@ class _Alignment:
         self._arm_m = attitude.rotation @ np.asarray(gnss.lever_arm_m)
         time_s, end_s = compute_seconds(gnss.stamp_ns, zero_ns), float(attitude.time_s[-1])
         std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
-        for share in (1.0, 0.5, 0.25, 0.125):  # gaps of fixes leave more windows where these are shorter
+        for share in (1.0, 0.5, 0.25, 0.125):  # with gaps of fixes, shorter windows are more
             window_s = share * min(10.0, 0.25 * end_s)
             apart = max(1, round(0.2 * window_s * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
             first = np.arange(0, time_s.size, apart)
             last = np.minimum(np.searchsorted(time_s, time_s[first] + window_s), time_s.size - 1)
             near = np.abs(time_s[last] - time_s[first] - window_s) < 0.3 * window_s
-            if near.sum() >= 3 * _FEWEST or window_s < 40.0 * std_m:  # at 0.5 m/s half of it shows no heading
+            if near.sum() >= 3 * _MIN_COUNT or window_s < 40.0 * std_m:  # at 0.5 m/s half of it determines no heading
                 break
         first, last = first[near], last[near]
         self._start_s, self._end_s = time_s[first], time_s[last]
@@ -282,14 +282,14 @@ class _Alignment:
         # The turn scale of an odometry is an error of heading that grows with the turn.
         self._turn = (attitude.yaw_rad - attitude.yaw_rad.mean()) * (attitude.role != IMU)
 
-    def _difference(self, values: Floats | Plane) -> Plane:
-        """Return the change over each window of what is on the grid (n,)."""
+    def _compute_changes(self, values: Floats | Plane) -> Plane:
+        """Return the change over each window of values on the grid (n,)."""
         time_s = self._attitude.time_s
         plane = np.asarray(values, np.complex128)
         return np.interp(self._end_s, time_s, plane) - np.interp(self._start_s, time_s, plane)
 
-    def _horizontal(self, forward: Floats, fit: _Fit) -> tuple[Plane, Plane]:
-        """Return velocity and arm, complex, on the grid."""
+    def _rotate_to_plane(self, forward: Floats, fit: _Fit) -> tuple[Plane, Plane]:
+        """Return horizontal velocity and lever arm, complex, on the grid."""
         turn, rotation = np.exp(1j * fit.turn_rad), self._attitude.rotation
         velocity = fit.scale * forward * (rotation[:, 0, 0] + 1j * rotation[:, 1, 0]) * turn
         ahead = np.exp(1j * (self._attitude.yaw_rad + fit.turn_rad))
@@ -297,20 +297,21 @@ class _Alignment:
         return velocity, arm
 
     def fit(self, forward: Floats) -> _Fit | None:
-        """Return scale, heading by knots, turn scale, arm and time offset; None where the fixes show no motion."""
+        """Return scale, heading by knots, turn scale, lever arm and time offset; None if the fixes do not move."""
         fix = self._moved_m[:, 0] + 1j * self._moved_m[:, 1]
         fit, time_s = _Fit(np.zeros_like(forward)), self._attitude.time_s
         turn = np.interp(self._middle_s, time_s, self._turn)
         for number in range(_ROUNDS):
-            velocity, arm = self._horizontal(forward, fit)
-            moved = self._difference(integrate_grid(velocity) + arm)
+            velocity, arm = self._rotate_to_plane(forward, fit)
+            moved = self._compute_changes(integrate_grid(velocity) + arm)
             length = np.abs(moved)
-            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, 0.2)  # shows a heading [m]
-            if moving.sum() < _FEWEST:
+            # Shorter displacements determine no heading [m].
+            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, 0.2)
+            if moving.sum() < _MIN_COUNT:
                 return None
             unit = np.conj(moved) / np.maximum(length, 1e-9)
             off = fix * unit - length
-            if number == 0:  # a heading at each knot, however far off
+            if number == 0:  # a heading at each knot, without a prior
                 seen = np.where(moving, fix * unit / np.maximum(np.abs(fix), 1e-9), 0.0)
                 towards = np.einsum("mk,m->k", self._hats, seen)
                 usable = np.abs(towards) > 0.5
@@ -321,14 +322,14 @@ class _Alignment:
                 continue
             noise = float(np.median(np.abs(off[moving]))) + 1e-6
             root = np.where(moving, 1.0, 0.0) / (1.0 + np.square(np.abs(off) / (2.5 * noise)))
-            spin = self._difference(np.exp(1j * (self._attitude.yaw_rad + fit.turn_rad))) * unit
+            spin = self._compute_changes(np.exp(1j * (self._attitude.yaw_rad + fit.turn_rad))) * unit
             columns = np.column_stack(
-                (length, 1j * length * turn, spin, 1j * spin, self._difference(velocity) * unit, 1j * length[:, None] * self._hats)
+                (length, 1j * length * turn, spin, 1j * spin, self._compute_changes(velocity) * unit, 1j * length[:, None] * self._hats)
             )  # fmt: skip
             # σ of scale and turn scale, lever arm [m], time offset [s] and headings [rad].
             prior = np.concatenate(([1.0, 0.5, 0.3, 0.3, 0.3], np.ones(self._knots_s.size)))
             before = np.zeros(prior.size)
-            before[2:5] = fit.arm_m.real, fit.arm_m.imag, fit.offset_s  # priors hold for these in all
+            before[2:5] = fit.arm_m.real, fit.arm_m.imag, fit.offset_s  # these priors apply to the sum of all rounds
             columns, off = columns * root[:, None], off * root
             matrix = np.concatenate((columns.real, columns.imag, np.diag(noise / prior)))
             target = np.concatenate((off.real, off.imag, -before * noise / prior))
@@ -344,12 +345,12 @@ class _Alignment:
         return fit
 
     def make_track(self, forward: Floats, fit: _Fit) -> OdometryTrack:
-        """Return the aligned track."""
-        velocity, arm = self._horizontal(forward, fit)
+        """Return the track, aligned with the fixes."""
+        velocity, arm = self._rotate_to_plane(forward, fit)
         speed = fit.scale * forward
         climb = speed * self._attitude.rotation[:, 2, 0]
         path = integrate_grid(np.stack((velocity.real, velocity.imag, climb), -1))
-        level = np.abs(velocity) * np.sign(speed)
+        horizontal_mps = np.abs(velocity) * np.sign(speed)
         heading = self._attitude.yaw_rad + fit.turn_rad
-        placed = np.stack((arm.real, arm.imag, self._arm_m[:, 2]), -1)
-        return OdometryTrack(level, heading, path, placed, fit.turn_std_rad)
+        arm_m = np.stack((arm.real, arm.imag, self._arm_m[:, 2]), -1)
+        return OdometryTrack(horizontal_mps, heading, path, arm_m, fit.turn_std_rad)

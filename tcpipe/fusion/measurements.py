@@ -1,14 +1,13 @@
-"""Measurements for the estimators: arrays in base_link axes and in the datum's ENU plane, every number usable.
+"""Measurements for the estimators: arrays in base_link axes and in the datum's ENU plane; every number is usable.
 
-What the stage has already done when one of these exists: units and frames converted, mounting rotations applied (lever
-arms are kept beside the values, since they act through the attitude), unusable rows taken out and counted, unknown or
-absurd variances replaced and floored. Rows are sorted by stamp, without repetitions.
+The stage has already converted units and frames, applied mounting rotations, excluded and counted unusable rows, and
+replaced variances that are unknown, implausible or too small. Lever arms are separate, since their effect depends on
+the attitude. Rows are sorted by stamp, without repetitions.
 
-A run is cut into sections, which are fused one by one. A clock epoch is a section of its own: nothing is integrated
-across a step of the clock. So is what follows a pause of all sensors of more than 5 s: the estimator does not carry its
-certainty over it. Both estimators take the `Measurements` of a section, its `InitialState` and the wanted stamps,
-increasing, inside the span of the measurements, and return a `Trajectory`: state of base_link, its uncertainty,
-rejected measurements.
+A run is cut into sections, which are fused one by one. A step of the clock starts a new section, and so does a pause of
+all sensors of more than 5 s: the estimate is too uncertain after it. Both estimators take the `Measurements` of a
+section, its `InitialState` and the output stamps, increasing, inside the span of the measurements. They return a
+`Trajectory`: state of base_link, its uncertainty, rejected measurements.
 """
 
 from __future__ import annotations
@@ -28,25 +27,22 @@ GNSS, IMU, WHEELS, VISUAL, DOPPLER = "gnss", "imu", "wheel_odometry", "visual_od
 """Roles, as in the rejections table."""
 _FIELDS = {GNSS: "gnss", DOPPLER: "doppler", IMU: "imu", WHEELS: "wheels", VISUAL: "visual"}
 POSE = "pose"
-FIXES = (GNSS, POSE)
-"""Roles of positions: a pose is fused as fixes with an attitude."""
+FIXES = (GNSS, POSE)  # roles of positions: a pose is fused as fixes with an attitude
 
-NO_TRUST = 1e6
-"""Largest variances, of a kilometre or a kilometre a second; larger ones would cost digits of differences."""
+MAX_VARIANCE = 1e6
+"""Largest variance [m² or m²/s²]; it marks values that are not measured. Larger variances would lose precision."""
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
 STATED_ARM_STD_M = (0.05, 0.05, 0.1)
-"""σ of a stated place of the antenna [m]: a tape measure, and the height of base_link over the ground."""
-UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)
-"""σ of a place that is not stated [m]: the antenna is on the robot."""
+"""σ of a stated antenna position [m]: error of a tape measure, and of the height of base_link over the ground."""
+UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)  # σ of an antenna position that is not stated [m]: the antenna is on the robot
 
 
-UNMEASURED_RAD2 = 1e2
-"""Variance of a rotation about an axis that is not measured."""
+UNMEASURED_RAD2 = 1e2  # Variance of a rotation about an axis that is not measured [rad²]
 
 
 @dataclass(frozen=True, slots=True)
 class Positions:
-    """GNSS: positions of an antenna. Or another program's pose: positions of a sensor, and the robot's attitude.
+    """Positions of an antenna (GNSS), or another program's pose: positions of a sensor, and the robot's attitude.
 
     Attributes
     ----------
@@ -55,13 +51,13 @@ class Positions:
     variance_m2 : [m²], shape (N, 3), east, north, up; floored, never unknown.
     lever_arm_m, lever_arm_std_m : [m], position of the antenna in base_link, and its standard deviation; 0: known
     exactly.
-    unclaimed : shape (N,), where the receiver claims none and the variance is the recipe's; None where it always claims
-    one.
+    unclaimed : shape (N,), whether the variance comes from the recipe because the receiver reports none; None if it
+        always reports one.
     quat_xyzw, rotation_variance_rad2 : attitude enu_from_base_link, shape (N, 4), NaN where absent, and variance about
         the robot's axes, shape (N, 3); None: no attitude is measured.
-    mounting_xyzw, mounting_std_rad : base_link_from_sensor of a pose, stated or as the motion shows it, and σ about
-    each axis.
-    lag_std_s : [s], standard deviation of the delay of its stamps: drivers stamp on arrival.
+    mounting_xyzw, mounting_std_rad : base_link_from_sensor of a pose, stated or estimated from the motion, and σ about
+        each axis.
+    lag_std_s : [s], standard deviation of the delay of the stamps: drivers stamp on arrival.
     """
 
     stamp_ns: Ints
@@ -78,23 +74,24 @@ class Positions:
 
     @property
     def has_claims(self) -> bool:
-        """Whether the receiver claims a variance for most fixes."""
+        """Whether the receiver reports a variance for most fixes."""
         return self.unclaimed is None or bool(self.unclaimed.mean() < 0.5)
 
     @property
     def has_heights(self) -> bool:
         """Whether any fix measures the height."""
-        return bool((self.variance_m2[:, 2] < NO_TRUST).any())
+        return bool((self.variance_m2[:, 2] < MAX_VARIANCE).any())
 
 
 @dataclass(frozen=True, slots=True)
 class GroundVelocities:
-    """A receiver's own velocity: that of the antenna of its fixes over ground, from Doppler.
+    """Velocity over ground of the antenna, measured by the receiver from Doppler.
 
     Attributes
     ----------
     stamp_ns : [ns], shape (N,), int64, increasing.
-    velocity_enu_mps : [m/s], shape (N, 3), east, north, up; up is 0 where it is not measured, its variance `NO_TRUST`.
+    velocity_enu_mps : [m/s], shape (N, 3), east, north, up; up is 0 where it is not measured, its variance
+        `MAX_VARIANCE`.
     variance_m2ps2 : [m²/s²], shape (N, 3); floored, never unknown.
     """
 
@@ -109,14 +106,14 @@ class BodyVelocities:
 
     Attributes
     ----------
-    stamp_ns : [ns], shape (N,), int64, increasing. Middle of the interval where a velocity comes from two poses.
+    stamp_ns : [ns], shape (N,), int64, increasing. If a velocity comes from two poses, the middle of their stamps.
     velocity_mps : [m/s], shape (N, 3), velocity of the point at ``lever_arm_m``. Wheels: only x is measured, y and z
     are NaN.
     variance_m2ps2 : [m²/s²], shape (N, 3); NaN exactly where the velocity is.
-    yaw_rate_radps : [rad/s], shape (N,), about base_link's z; NaN where the source gives none.
+    yaw_rate_radps : [rad/s], shape (N,), about base_link's z; NaN where it is not measured.
     lever_arm_m : [m], the measured point in base_link.
     turn_rate_radps : [rad/s], shape (N, 3), about all three axes of base_link, z as in ``yaw_rate_radps``; None where
-        the source is flat (wheels) or gives none.
+        the source measures only yaw (wheels) or no turn rate.
     """
 
     stamp_ns: Ints
@@ -129,7 +126,7 @@ class BodyVelocities:
     @property
     def measured(self) -> Mask:
         """Axes along which most rows have a velocity, shape (3,)."""
-        is_measured: Mask = (self.variance_m2ps2 < 1e3).mean(0) > 0.5  # above: not measured (ruling)
+        is_measured: Mask = (self.variance_m2ps2 < 1e3).mean(0) > 0.5  # above: not measured (by judgement)
         return is_measured
 
 
@@ -145,10 +142,10 @@ class InertialMeasurements:
     quat_xyzw : shape (N, 4), enu_from_base_link by the unit's own attitude filter; NaN where absent. Yaw may be
     magnetic or offset.
     gyro_std_radps, accelerometer_std_mps2 : white noise at the unit's rate, one axis.
-    accelerometer_usable : False where the specific force is not one (gravity removed, other units): the gyroscope alone
-    is used.
-    accelerometer_noise_mps2 : the same around each sample, shape (N,): the motion causes vibration; None:
-    the same throughout.
+    accelerometer_usable : False if the values are no specific force (gravity removed, other units); then only the
+        gyroscope is used.
+    accelerometer_noise_mps2 : noise around each sample, shape (N,), which includes vibration by the motion; None:
+        constant noise.
     """
 
     stamp_ns: Ints
@@ -168,8 +165,8 @@ Sensor = Positions | GroundVelocities | InertialMeasurements | BodyVelocities
 class Measurements:
     """All measurements of one section of one clock epoch without a long gap; a role without measurements is None.
 
-    At least one of ``gnss``, ``wheels`` and ``visual`` is there. ``nonholonomic_std_mps``: sideways and vertical body
-    velocity are zero to within this. ``doppler`` is the velocity of the antenna of ``gnss``.
+    At least one of ``gnss``, ``wheels`` and ``visual`` is not None. ``nonholonomic_std_mps``: sideways and vertical
+    body velocity are zero to within this. ``doppler`` is the velocity of the antenna of ``gnss``.
     """
 
     gnss: Positions | None = None
@@ -180,18 +177,18 @@ class Measurements:
     doppler: GroundVelocities | None = None
 
     def sensors(self) -> dict[str, Sensor]:
-        """Return the sensors that are there, by role."""
+        """Return the existing sensors by role."""
         every = {role: getattr(self, name) for role, name in _FIELDS.items()}
         return {role: sensor for role, sensor in every.items() if sensor is not None}
 
     def replace_sensors(self, changed: Mapping[str, Sensor | None]) -> Measurements:
-        """Return the measurements with other sensors, by role; None takes one out."""
+        """Return the measurements with some sensors replaced, by role; None removes a sensor."""
         named: dict[str, Any] = {_FIELDS[role]: sensor for role, sensor in changed.items()}
         return replace(self, **named)
 
     @property
     def is_antenna_alone(self) -> bool:
-        """Whether only fixes, and a receiver's own velocity, measure motion: forward and backward look the same."""
+        """Whether only fixes and a receiver's velocity measure motion: forward and backward are indistinguishable."""
         return self.gnss is not None and self.imu is None and not self.odometries() and not self.has_attitude
 
     @property
@@ -211,24 +208,24 @@ class Measurements:
         return self.imu is not None or (variance is not None and float(variance[0, 0]) < UNMEASURED_RAD2)
 
     def odometries(self) -> dict[str, BodyVelocities]:
-        """Return the odometries that are there, by role; the wheels' first."""
+        """Return the existing odometries by role, wheels first."""
         every = {WHEELS: self.wheels, VISUAL: self.visual}
         return {role: odometry for role, odometry in every.items() if odometry is not None}
 
     def turning_odometries(self) -> dict[str, BodyVelocities]:
-        """Return the odometries that have a yaw rate, by role: the wheels, which skid, then the camera."""
+        """Return the odometries that measure a yaw rate, by role: wheels (which skid), then the camera."""
         every = self.odometries().items()
         return {role: odometry for role, odometry in every if np.isfinite(odometry.yaw_rate_radps).any()}
 
     @property
     def first_odometry(self) -> BodyVelocities | None:
-        """The wheels, else visual odometry."""
+        """Wheel odometry, or visual odometry without wheels."""
         return self.wheels or self.visual
 
 
 @dataclass(frozen=True, slots=True)
 class InitialState:
-    """Where a section starts, found offline from all of its data (`tcpipe.fusion.initial`).
+    """State at the start of a section, estimated from all of its data (`tcpipe.fusion.initial`).
 
     Attributes
     ----------
@@ -236,8 +233,8 @@ class InitialState:
     quat_xyzw : shape (4,), enu_from_base_link.
     tilt_std_rad, yaw_std_rad : standard deviation of roll and pitch, and of yaw.
     velocity_enu_mps, velocity_std_mps : [m/s], shape (3,) and scalar.
-    gyro_bias_radps : [rad/s], shape (3,); zero where the robot never stands.
-    heading_from : how yaw was found: ``course over ground``, ``pose``, ``orientation``, ``local frame`` or ``unknown``.
+    gyro_bias_radps : [rad/s], shape (3,); zero if the robot is never stationary.
+    heading_from : source of the yaw: ``course over ground``, ``pose``, ``orientation``, ``local frame`` or ``unknown``.
     """
 
     position_enu_m: Floats
@@ -256,7 +253,7 @@ _Source = TypeVar("_Source", bound=Sensor)
 
 
 def select_measurements(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
-    """Return the measurements between two stamps, both included; a sensor without any is None."""
+    """Return the measurements between two stamps, both included; a sensor without measurements is None."""
     found: dict[str, Sensor | None] = {}
     for role, source in whole.sensors().items():
         rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
@@ -265,14 +262,14 @@ def select_measurements(whole: Measurements, start_ns: int, end_ns: int) -> Meas
 
 
 def select_sensor_rows(source: _Source, rows: slice | Mask) -> _Source:
-    """Return a sensor with some of its rows."""
+    """Return a sensor with the selected rows."""
     values = {field.name: getattr(source, field.name) for field in fields(source)}
     chosen: dict[str, Any] = {name: value[rows] for name, value in values.items() if isinstance(value, np.ndarray)}
     return replace(source, **chosen)
 
 
 DISPLACEMENT_LAGS_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-"""Durations over which a smoother states the uncertainty of a displacement [s]."""
+"""Durations for which a smoother computes the uncertainty of a displacement [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,19 +278,19 @@ class Trajectory:
 
     Attributes
     ----------
-    stamp_ns : [ns], shape (N,), int64: exactly the wanted stamps.
+    stamp_ns : [ns], shape (N,), int64: exactly the output stamps.
     position_enu_m, position_std_m : [m], shape (N, 3).
     quat_xyzw : shape (N, 4), enu_from_base_link, unit length.
     velocity_enu_mps : [m/s], shape (N, 3), velocity of base_link.
     angular_velocity_radps : [rad/s], shape (N, 3), base_link axes.
     yaw_std_rad : [rad], shape (N,).
     forward_velocity_std_mps : [m/s], shape (N,), of the velocity along base_link's x axis.
-    rejections : what the gate rejected, in time order: columns of the level REJECTIONS, shape (M,).
+    rejections : measurements that the gate rejected, in time order: columns of the level REJECTIONS, shape (M,).
     displacement_std_m : [m], shape (N, 6), of the horizontal displacement from each row to the one
-        `DISPLACEMENT_LAGS_S` later, along its direction, the correlation of both ends counted exactly; NaN where there
-        is no such row, and throughout in a forward filter, which does not know it. In between the variance may be
-        interpolated in time, from zero at no time.
-    facts : what the filter counted and settled on.
+        `DISPLACEMENT_LAGS_S` later, along its direction, with the exact correlation of both ends; NaN where there
+        is no such row, and always in a forward filter, which does not compute it. In between the variance may be
+        interpolated in time, from zero at duration zero.
+    facts : counts and estimated parameters of the filter.
     """
 
     stamp_ns: Ints
@@ -310,7 +307,7 @@ class Trajectory:
 
 
 PAUSE_NS = 5_000_000_000
-"""A longer pause of all sensors begins a new section [ns]: the estimator does not carry its certainty over it."""
+"""Longest pause of all sensors within a section [ns]; after a longer one the estimate is too uncertain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,9 +321,9 @@ class TrackSection:
 
 
 def cut_sections(measurements: Mapping[int, Measurements], cuts_ns: Sequence[int] = ()) -> list[TrackSection]:
-    """Return the sections of measurements by clock epoch, in order of epoch and time, without those without motion.
+    """Return the sections of all clock epochs in order of time; sections without motion measurements are left out.
 
-    A section ends at a pause, and before each of the stamps ``cuts_ns`` of a measurement.
+    A section ends at a pause, and before each of the measurement stamps ``cuts_ns``.
     """
     found = []
     for epoch in sorted(measurements):
@@ -346,10 +343,10 @@ def cut_sections(measurements: Mapping[int, Measurements], cuts_ns: Sequence[int
 
 
 def make_track_stamps(section: TrackSection, *, period_ns: int, max_gap_ns: int) -> Ints:
-    """Return the multiples of the period inside a section [ns], without those in a gap.
+    """Return the multiples of the period inside a section [ns], except those in a gap.
 
-    A gap is a time without any of GNSS, wheels and visual odometry longer than ``max_gap_ns`` and than 2.5 times their
-    usual spacing: the IMU alone does not determine a track. A gap is a step in the stamps.
+    A gap is a time without GNSS, wheels and visual odometry that is longer than ``max_gap_ns`` and than 2.5 times their
+    usual period: an IMU alone does not determine a track. In the track a gap is a step of the stamps.
     """
     first = -(-section.start_ns // period_ns) * period_ns
     stamp = np.arange(first, section.end_ns + 1, period_ns, dtype=np.int64)

@@ -1,14 +1,14 @@
-"""Residuals of every pair of sensors over windows of several lengths, and what each density adds to their variance.
+"""Residuals of every pair of sensors over windows of several lengths, and the densities that explain their variance.
 
-A residual is the motion by one sensor less that by another, over a window of Δ seconds: of fixes against an odometry
-along and across the heading in the window's middle, and up; of two odometries along. Its variance is a sum of densities
-times features, which are integrals over the path driven in the window:
+A residual is the motion by one sensor minus the motion by another, over a window of Δ seconds. Fixes and an odometry
+are compared along and across the heading in the window's middle, and upward; two odometries only along it. The variance
+of a residual is a sum of densities times features, which are integrals over the path driven in the window:
 
-- fixes: white noise and Gauss-Markov processes, on each axis, also at rest;
-- an odometry: white velocity noise, and a scale as Gauss-Markov processes; a scale that all odometries share, which no
-pair of them shows;
+- fixes: white noise and Gauss-Markov processes, on each axis, also when stationary;
+- an odometry: white velocity noise, and a scale as Gauss-Markov processes; a common scale of all odometries, which
+cancels in the comparison of two odometries;
 - slide: white noise of the sideways velocity; heading and pitch: Gauss-Markov errors of the direction in which an
-odometry is added up.
+odometry is integrated.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FIX_S, SCALE_S = (1.0, 3.0, 10.0, 30.0, 100.0), (3.0, 10.0, 30.0, 100.0)
 """Correlation times of processes [s]: of fixes, of scales and directions."""
 
 _STILL_MPS = 0.02  # slower: stationary
-_PAIR_STEP_S = 0.1  # between windows' ends of sensors that are no fixes
+_PAIR_STEP_S = 0.1  # between window ends of two odometries
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +49,8 @@ class Residuals:
     ----------
     start_ns, end_ns : [ns], shape (M,).
     value : [m], shape (M,).
-    features : by name of a density, its factor in the variance of each value, shape (M,).
-    is_still : shape (M,), the robot is stationary throughout.
+    features : by density name, the factor of the density in the variance of each value, shape (M,).
+    is_still : shape (M,), whether the robot is stationary in the whole window.
     """
 
     pair: tuple[str, str]
@@ -65,7 +65,7 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """A section's measurements and attitude; rows where windows without fixes may end, and their stamps [ns]."""
+    """Measurements and attitude of a section; rows where windows of odometries may end, and their stamps [ns]."""
 
     measurements: Measurements
     attitude: Attitude
@@ -74,9 +74,9 @@ class _Section:
     at_ns: Ints
 
     def choose_windows(self, at_ns: Ints, sources: Sequence[Ints]) -> Iterator[tuple[float, Ints, Ints]]:
-        """Yield each time difference with first and last rows of its windows among increasing stamps (N,).
+        """Yield time difference, first rows and last rows of windows among increasing stamps (N,).
 
-        No source, by its stamps, has a gap within a window.
+        No window contains a gap of a source; ``sources`` are their stamps.
         """
         at_s = compute_seconds(at_ns, self.zero_ns)
         period_s = max(float(np.median(np.diff(at_s))), 1e-3) if at_s.size > 1 else np.inf
@@ -84,7 +84,7 @@ class _Section:
         for time_s in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0):  # time differences [s]
             if time_s < 0.9 * period_s:
                 continue
-            # Eight begin in the length of one, and there are 600 of one length at most.
+            # Eight windows start within the length of one; at most 600 windows have one length.
             first = np.arange(0, at_s.size, max(1, round(time_s / 8 / period_s), -(-at_s.size // 600)))
             last = np.searchsorted(at_s, at_s[first] + time_s - 0.5 * period_s)
             first, last = first[last < at_s.size], last[last < at_s.size]
@@ -97,7 +97,7 @@ class _Section:
 
 
 def find_residuals(measurements: Measurements) -> list[Residuals]:
-    """Return the residuals of all pairs of sensors that can be compared; none without odometry or without turns."""
+    """Return the residuals of all pairs of sensors that can be compared; empty without odometry or turn rates."""
     motion, gnss = find_level_motion(measurements), measurements.gnss
     if motion is None or motion.attitude.role == COURSE:
         return []
@@ -119,12 +119,12 @@ def find_residuals(measurements: Measurements) -> list[Residuals]:
 def _compare_fixes(
     section: _Section, gnss: Positions, role: str, track: OdometryTrack, speed_mps: Floats
 ) -> list[Residuals]:
-    """Return the residuals of fixes against an aligned track; ``speed_mps`` (n,) shows whether the robot moves."""
+    """Return the residuals of fixes against an aligned track; ``speed_mps`` (n,) determines whether the robot moves."""
     attitude = section.attitude
     fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
     off = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
     off = np.stack([remove_spikes(axis, fill=np.nan) for axis in off.T], -1)
-    if gnss.unclaimed is not None and gnss.has_claims:  # the recipe's variance of the others is a guess
+    if gnss.unclaimed is not None and gnss.has_claims:  # the recipe's variance for unclaimed fixes is a guess
         off[gnss.unclaimed] = np.nan
     has_others = len(section.measurements.odometries()) > 1
     sources = (section.measurements.odometries()[role].stamp_ns, attitude.source_ns)
@@ -150,7 +150,7 @@ def _compare_fixes(
 
 
 def _describe_fixes(gnss: Positions, axis: str, first: Ints, last: Ints, time_s: float) -> dict[str, Floats]:
-    """Return the factors of the fixes' densities, which are those of a fix of the median claim."""
+    """Return the factors of the fixes' densities, which belong to a fix with the median claim."""
     claimed = gnss.variance_m2[:, 2] if axis == UP else gnss.variance_m2[:, :2].mean(1)
     share = claimed / np.median(claimed)
     a, b = share[first], share[last]
@@ -189,7 +189,7 @@ def _compare_odometries(
 
 
 def _take_nodes(values: Floats, start_s: Floats, end_s: Floats) -> Floats:
-    """Return what is on the grid in the middles of the parts of each window, (M, nodes)."""
+    """Return the grid values at the middles of equal parts of each window, (M, nodes)."""
     nodes = max(2, min(40, round(float(np.median(end_s - start_s)) / STEP_S)))
     part = (np.arange(nodes) + 0.5) / nodes
     rows = np.rint((start_s[:, None] + (end_s - start_s)[:, None] * part) / STEP_S).astype(np.int64)
@@ -220,21 +220,21 @@ class _Window:
         self.length_m = np.abs(self._speed).sum(1) * self._step_s
 
     def is_still(self, speed_mps: Floats) -> Mask:
-        """Return whether the robot neither moves nor turns in each window."""
+        """Return, for each window, whether the robot neither moves nor turns."""
         turned = np.ptp(_take_nodes(self._yaw, *self._span), axis=1)
         return np.asarray(
             (_take_nodes(speed_mps, *self._span) < _STILL_MPS).all(1) & (turned < 0.02 + 0.01 * self.time_s)  # rad
         )
 
     def describe(self, role: str, axis: str, *, has_others: bool) -> dict[str, Floats]:
-        """Return the factors of the densities of an odometry that is compared with fixes."""
+        """Return the factors of the densities of an odometry in a comparison with fixes."""
         if axis == UP:
             pitch = {f"pitch scale {tau:g}": _integrate_process(self._speed, self.time_s, tau) for tau in SCALE_S}
             return pitch | {
                 f"{role} scale {tau:g}": _integrate_process(self._climb, self.time_s, tau) for tau in SCALE_S
             }
         features = self.describe_odometry(role, axis)
-        if has_others:  # a scale that all share looks like that of a lone odometry
+        if has_others:  # of a single odometry the common scale is indistinguishable from its own
             features |= {f"shared scale {tau:g}": features[f"{role} scale {tau:g}"] for tau in SCALE_S}
         other = self._speed * (self._aside if axis == ALONG else self._ahead)
         features |= {f"heading scale {tau:g}": _integrate_process(other, self.time_s, tau) for tau in SCALE_S}
@@ -242,7 +242,7 @@ class _Window:
         return features
 
     def describe_odometry(self, role: str, axis: str) -> dict[str, Floats]:
-        """Return the factors of an odometry's own densities."""
+        """Return the factors of the own densities of an odometry."""
         direction = self._ahead if axis == ALONG else self._aside
         forward = self._speed * direction
         features = {f"{role} scale {tau:g}": _integrate_process(forward, self.time_s, tau) for tau in SCALE_S}
@@ -250,6 +250,6 @@ class _Window:
         return features
 
     def _integrate_moving(self, direction: Floats) -> Floats:
-        """Return the time [s] that the robot moves, by the square of a direction cosine (M, nodes)."""
+        """Return the time in motion [s], weighted with the square of a direction cosine (M, nodes)."""
         moving = np.abs(self._speed) > 1e-3
         return np.asarray((moving * direction**2).sum(1) * self._step_s)

@@ -1,7 +1,7 @@
-"""Parameters of the estimator: what is known of each beforehand, and how it wanders.
+"""Parameters of the estimator: prior and random walk of each.
 
-Each is an entry of the state. What the measurements do not show of a parameter keeps its prior by the update itself,
-and its uncertainty is part of that of the track. Noise of the sensors: `tcpipe.fusion.densities`.
+Each parameter is an entry of the state. An unobservable parameter keeps its prior, and its uncertainty is part of the
+uncertainty of the track. Noise of the sensors: `tcpipe.fusion.densities`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from tcpipe.arrays import Floats
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory
-from tcpipe.fusion.measurements import IMU, NO_TRUST, VISUAL, WHEELS, InitialState, Measurements, Positions
-from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, is_length_observable, turn_scale_std
+from tcpipe.fusion.measurements import IMU, MAX_VARIANCE, VISUAL, WHEELS, InitialState, Measurements, Positions
+from tcpipe.fusion.process import SLOPE_RAD, find_scale_stds, find_turn_scale_std, is_length_observable
 from tcpipe.fusion.state import Error, Kind, Mode
 from tcpipe.fusion.ticks import Ticks
 from tcpipe.geometry.rotation import matrix_from_quat
@@ -25,9 +25,9 @@ from tcpipe.geometry.rotation import matrix_from_quat
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A parameter: its first entry in the errors, their number, prior standard deviation, and that of a second's walk.
+    """A parameter: index of its first error, number of errors, prior σ, and σ of the random walk in one second.
 
-    A deviation of 0 is another for each run, as the source says.
+    A σ of 0 is set for each run; ``source`` says how.
     """
 
     name: str
@@ -46,7 +46,7 @@ PARAMETERS = (
     Parameter("lag of fixes", Error.FIX_LAG, 1, 0.0, 1e-3, "s", "`Positions.lag_std_s`"),
     Parameter("wheel scale", Error.WHEEL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
     Parameter("camera scale", Error.VISUAL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
-    Parameter("turn scale", Error.TURN_SCALE, 1, 0.0, 0.0, "1", "`process.turn_scale_std`"),
+    Parameter("turn scale", Error.TURN_SCALE, 1, 0.0, 0.0, "1", "`process.find_turn_scale_std`"),
     Parameter(
         "turning centre", Error.TURNING_CENTRE, 1, 0.05, 0.0, "m", "skid-steered robots turn ahead of their middle"
     ),
@@ -57,16 +57,16 @@ PARAMETERS = (
     Parameter("mounting of the pose", Error.POSE_MOUNT, 3, 0.0, 0.0, "rad", "`Positions.mounting_std_rad`"),
     Parameter("frame of the pose", Error.POSE_FRAME, 3, 0.05, 2e-3, "rad", "level to 3°; drifts by 1° a minute"),
 )
-"""Parameters with a prior of their own; `make_priors` finds scales of odometries and errors of fixes in the run."""
+"""Parameters with a fixed prior; `make_priors` estimates scales of odometries and errors of fixes from the run."""
 FIX_AXES = np.array([1.0, 1.0, 1.7])
-"""Ratio of lasting errors of fixes east, north and up [1]: no satellite is below."""
-_UNSEEN_SHARE = 0.25  # of the claimed variance of fixes [1]: errors of hours, by base, antenna and troposphere
+"""Ratio of lasting errors of fixes east, north and up [1]: no satellite is below the antenna."""
+_UNSEEN_SHARE = 0.25  # of the claimed variance [1]: errors that last hours (base, antenna, troposphere)
 _MINUTE_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Change of the error at ``place`` at a tick by ``mean`` ± ``std``, or, if ``is_new``, a new draw of its prior."""
+    """Change of the error ``place`` at a tick by ``mean`` ± ``std``, or, if ``is_new``, a new draw from its prior."""
 
     tick: int
     place: int
@@ -100,17 +100,17 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     scales = find_scale_stds(m, noise.horizontal)
     for role, place in ((WHEELS, Error.WHEEL_SCALE), (VISUAL, Error.VISUAL_SCALE)):
         if role in m.odometries() and scales[role]:
-            # In 100 s the mean of a varying scale strays by as much as the scale varies.
+            # Within 100 s the mean of a varying scale changes as much as the scale varies.
             std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].correlated.variance / 100.0)
     time_s = np.full(state.N, np.inf)
     if m.odometries() and is_length_observable(m, noise.horizontal):
-        # Only fixes show how scales vary around their means.
+        # Only with fixes is the variation of a scale around its mean observable.
         slips = {WHEELS: Error.WHEEL_SLIP, VISUAL: Error.VISUAL_SLIP}
         varying = [(slips[role], noise.odometries[role].correlated) for role in m.odometries()]
         for error, process in (*varying, (Error.SHARED_SCALE, noise.shared_scale)):
             std[error], time_s[error] = np.sqrt(process.variance), process.time_s
-    std[Error.TURN_SCALE] = turn_scale_std(m)
-    # Wheels skid otherwise in each turn.
+    std[Error.TURN_SCALE] = find_turn_scale_std(m)
+    # Wheels skid differently in each turn.
     walk[Error.TURN_SCALE] = 0.0 if has_imu else np.sqrt(2.0 / _MINUTE_S) * std[Error.TURN_SCALE]
     if m.gnss is not None:
         if wanted["lag of fixes"]:
@@ -123,14 +123,15 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
 
 
 def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> Floats:
-    """Return the standard deviation of what fixes err throughout the section [m], shape (3,).
+    """Return the standard deviation of the constant error of fixes in the section [m], shape (3,).
 
-    Fixes claim it beyond the errors that the section shows; at least it is `_UNSEEN_SHARE` of the claimed variance.
-    Without tilt it includes the place of the antenna, which sways, and without heights, which show slopes, the sway.
+    It is the part of the claimed variance that the section does not show as noise, at least `_UNSEEN_SHARE` of it.
+    Without measured tilt it includes the motion of the antenna by tilt. Without heights it includes that motion by
+    slopes.
     """
     axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
     shown, claimed = np.array([(fix.white + fix.correlated.variance, fix.claimed_m2) for fix in axes]).T
-    variance = np.maximum(claimed - shown, _UNSEEN_SHARE * claimed * (claimed < NO_TRUST))
+    variance = np.maximum(claimed - shown, _UNSEEN_SHARE * claimed * (claimed < MAX_VARIANCE))
     variance += np.where(_find_arm_axes(m), 0.0, np.square(gnss.lever_arm_std_m))
     if not m.has_tilt and (m.is_antenna_alone or not gnss.has_heights):
         variance[:2] += (SLOPE_RAD * gnss.lever_arm_m[2]) ** 2
@@ -138,12 +139,12 @@ def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> 
 
 
 def _find_arm_axes(m: Measurements) -> tuple[bool, bool, bool]:
-    """Return the axes along which tilt shows where the antenna is; noise of a camera's roll looks like another height."""
+    """Return the axes along which the lever arm is observable by tilt; noise of a camera's roll mimics height."""
     return m.has_tilt, m.has_tilt, m.has_absolute_tilt
 
 
 def find_walk(process: GaussMarkov) -> float:
-    """Return the deviation of a second's walk that strays as far as a Gauss-Markov process over a minute."""
+    """Return the σ of the random walk in one second that reaches the σ of a Gauss-Markov process within a minute."""
     return float(np.sqrt(2.0 * process.variance * -np.expm1(-_MINUTE_S / process.time_s) / _MINUTE_S))
 
 
@@ -176,7 +177,7 @@ _DEPENDS: Mapping[int, Sequence[int]] = {
     state.KINDS: (*range(Error.GYRO_BIAS), Error.TURN_SCALE),
     state.KINDS + 1: (*range(state.MOVING), Error.TURN_SCALE),
 }
-"""Errors on which each kind of measurement depends, and motion by odometry and by gyroscope."""
+"""Errors on which each kind of measurement depends; the last two: motion by odometry and by gyroscope."""
 
 
 def make_model(
@@ -192,8 +193,7 @@ def make_model(
 ) -> FilterModel:
     """Return the filter's model.
 
-    ``possible``: errors that other events could change; where these are judged, rejected fixes are never taken to be
-    right after all.
+    ``possible``: errors that further events could change; with such errors there are no gate resets.
     """
     kept = np.ones(state.N) if time_s is None else np.exp(-period_s / time_s)
     involved = {event.place for event in events} | set(possible)
@@ -227,7 +227,7 @@ def make_model(
 
 
 def make_start(initial: InitialState, std: Floats, arm_m: Sequence[float]) -> Memory:
-    """Return the filter's state at the first tick, of all errors."""
+    """Return the state of all errors at the first tick."""
     x, P = np.zeros(state.NX), np.zeros((state.N, state.N))
     rotation = matrix_from_quat(initial.quat_xyzw)
     x[:9] = rotation.ravel()
@@ -247,7 +247,7 @@ def make_start(initial: InitialState, std: Floats, arm_m: Sequence[float]) -> Me
 
 
 def widen_start(start: Memory, std: Floats) -> Memory:
-    """Return the start of all errors with the standard deviations ``std``, shape (45,), of the errors of fixes."""
+    """Return the start with the standard deviations ``std``, shape (45,), for the errors of fixes."""
     widened = start.copy()
     for place in range(Error.FIX_ERROR, Error.FIX_OFFSET + 3):
         widened.P[place, place] = std[place] ** 2

@@ -1,9 +1,9 @@
-"""From a stream's columns to measurements: base_link axes, the datum's plane, usable variances, one row a stamp.
+"""Convert columns of streams to measurements: base_link axes, the datum's plane, usable variances, one row per stamp.
 
-Rows without a measurement (no velocity and no pose to make one from, a fix at 0, 0, a sample beyond any sensor's range)
-are excluded and returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is
-replaced by the recipe's, or by the median of the stated ones where that is larger; one that is too small is raised to a
-floor: a zero covariance is not trust. Coordinates with few decimals err by rounding besides.
+Rows without a measurement (neither velocity nor pose, a fix at 0, 0, a sample beyond any sensor's range) are excluded
+and returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is replaced by the
+larger of the recipe's variance and the median of the stated variances. A variance below a floor is raised to it. The
+rounding error of coordinates with few decimals is added.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.fusion.attitude import add_attitude, compute_turns
 from tcpipe.fusion.measurements import (
     IMU,
-    NO_TRUST,
+    MAX_VARIANCE,
     VISUAL,
     WHEELS,
     BodyVelocities,
@@ -38,23 +38,21 @@ from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
-Columns = Mapping[str, Floats]
-"""Columns of a stream by name, null as NaN."""
+Columns = Mapping[str, Floats]  # columns of a stream by name, null as NaN
 
 _IMU = Subject("role", IMU)
 _QUAT = ("quat_x", "quat_y", "quat_z", "quat_w")
 _VELOCITY_FLOOR_MPS = 0.02  # no odometry is better
 _MAX_VELOCITY_MPS = 50.0  # no robot is faster
-GRAVITY_BAND_MPS2 = (8.0, 12.0)
-"""Median size of a specific force that contains gravity [m/s²]."""
+GRAVITY_BAND_MPS2 = (8.0, 12.0)  # Median size of a specific force that contains gravity [m/s²]
 _SLICE_ROWS = 1 << 16
-_FEWEST = 20  # samples that show a grid or a turn
+_MIN_COUNT = 20  # fewest samples to find a grid or a turn [1]
 _JITTER_STEPS = 41  # pairs of fixes in a window of the estimate of jitter
 
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """Result of preparing a stream: stamps of unusable rows, repeated rows, replaced variances; and findings."""
+    """Result of preparing a stream: stamps of unusable rows, counts of repeated and replaced rows; findings."""
 
     invalid_ns: Ints
     repeated: int = 0
@@ -68,8 +66,8 @@ def find_datum(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> tuple[float, 
     if usable.size == 0:
         return None
     first = lon_deg[usable[0]]
-    turned = (lon_deg[usable] - first + 180.0) % 360.0 - 180.0  # fixes on both sides of the date line
-    lon = (first + float(np.median(turned)) + 180.0) % 360.0 - 180.0
+    rotated = (lon_deg[usable] - first + 180.0) % 360.0 - 180.0  # for fixes on both sides of the date line
+    lon = (first + float(np.median(rotated)) + 180.0) % 360.0 - 180.0
     return float(lon), float(np.median(lat_deg[usable])), float(np.median(alt_m[usable]))
 
 
@@ -91,7 +89,7 @@ def prepare_positions(
 ) -> tuple[Positions, Prepared]:
     """Prepare GNSS fixes (columns of the role gnss); unknown σ: ``default_std_m`` horizontally, twice vertically.
 
-    Or a pose (columns of the role pose), whose sensor is turned by ``mounting_xyzw`` to base_link.
+    Also for a pose (columns of the role pose); ``mounting_xyzw`` rotates its sensor's axes to base_link.
     """
     lon, lat, alt = columns["lon_deg"], columns["lat_deg"], columns["alt_m"]
     is_fix = _is_fix(lon, lat, alt)
@@ -100,9 +98,9 @@ def prepare_positions(
     default = np.square(default_std_m * np.array([1.0, 1.0, 2.0]))
     unclaimed = np.asarray(~_is_known(variance[:, :2]).all(1))
     variance, replaced = _clean_variances(variance, default, floor_std_m**2)
-    degree_m = 111_320.0 * np.array([np.cos(np.radians(datum_deg_m[1])), 1.0])  # of longitude, and of latitude
+    degree_m = 111_320.0 * np.array([np.cos(np.radians(datum_deg_m[1])), 1.0])  # degree of longitude, and of latitude
     rounding = _compute_rounding_variances(np.column_stack((lon, lat))[usable]) * degree_m**2
-    unclaimed |= (rounding > variance[:, :2]).any(1)  # the receiver does not know how its coordinates are written
+    unclaimed |= (rounding > variance[:, :2]).any(1)  # the receiver's claim ignores the rounding of its coordinates
     variance[:, :2] += rounding
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
     prepared = Prepared(stamp_ns[~is_fix], repeated, replaced)
@@ -116,13 +114,15 @@ def prepare_positions(
 
 
 def _compute_rounding_variances(values: Floats) -> Floats:
-    """Return the variance of rounding by axis of values (N, k), shape (k,): grid²/12 times the rows per value.
+    """Return the rounding variance of each axis of values (N, k), shape (k,): grid²/12 times the rows per value.
 
-    All axes have one grid: the smallest step between their values, of which every step is a multiple. Rows with one
-    value have one error, which does not average out; it is below the grid.
+    All axes have one grid: the smallest step between values, of which every step is a multiple. Rows with one value
+    have the same error, which does not average out.
     """
-    steps = np.concatenate([np.diff(np.unique(axis.round(10))) for axis in values.T])  # binary numbers differ by less
-    multiples = steps / steps.min() if steps.size >= _FEWEST else np.array([0.5])
+    steps = np.concatenate(
+        [np.diff(np.unique(axis.round(10))) for axis in values.T]
+    )  # ignore smaller binary differences
+    multiples = steps / steps.min() if steps.size >= _MIN_COUNT else np.array([0.5])
     if (np.abs(multiples - np.rint(multiples)) > 0.01).any():
         return np.zeros(values.shape[1])
     rows = values.shape[0] / (1 + np.count_nonzero(np.diff(values, axis=0), axis=0))
@@ -130,13 +130,12 @@ def _compute_rounding_variances(values: Floats) -> Floats:
 
 
 def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tuple[Positions, list[list[int]]]:
-    """Return the fixes without exact repetitions of the one before, and those that occur while the robot drives.
+    """Return the fixes without exact repetitions, and the repetitions while the robot drives.
 
-    Each of the latter is its first and last stamp [ns] and the number of repetitions.
-
-    They carry no information: a receiver hangs, or a slow one is published at a higher rate. Without odometry a robot
-    may be stationary where fixes repeat for a second and two of their periods: they are kept. So are fixes that never
-    change.
+    Each of the latter is a list of first stamp [ns], last stamp [ns] and number of repetitions. Causes are a receiver
+    that hangs, or a slow receiver whose fixes are published at a higher rate. Repetitions carry no information. They
+    are kept if the robot may be stationary: without odometry, if they last longer than a second and two periods, and if
+    fixes never change.
     """
     stamp_ns = gnss.stamp_ns
     changes = np.concatenate(([True], (np.diff(gnss.position_enu_m, axis=0) != 0.0).any(1)))
@@ -145,7 +144,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
         return gnss, []
     last = np.append(first[1:], stamp_ns.size) - 1
     kept_ns = stamp_ns[last] - stamp_ns[first]
-    lasting = kept_ns >= max(1_000_000_000, 2 * compute_median_period_ns(stamp_ns[first]))  # less: a slow receiver
+    lasting = kept_ns >= max(1_000_000_000, 2 * compute_median_period_ns(stamp_ns[first]))  # shorter: a slow receiver
     if odometry is None:
         kept = changes | np.repeat(lasting, last - first + 1)
         return (gnss if kept.all() else select_sensor_rows(gnss, kept)), []
@@ -158,13 +157,13 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
 
 
 def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Positions, Floats]:
-    """Return the fixes with variances raised for jitter of stamps, and the σ of each stamp [s], shape (N,).
+    """Return the fixes with variances inflated for jitter of stamps, and the σ of each stamp [s], shape (N,).
 
-    A fix that is stamped when it is sent seems to stand still and then to leap. The distance between two fixes is
-    compared with that of the odometry, times the local ratio of the two (slip). The scatter of this residual beyond the
-    stated noise, over the speed, is the jitter: 0 where it is small or unknown, and that of the nearest motion while
-    the robot is stationary. The variance grows by (2 speed jitter)²: late fixes follow each other, and a filter of
-    white errors must not average them.
+    If a driver stamps a fix when it sends it, positions seem to stop and then to jump. The distance between two fixes
+    is compared with that of the odometry, times the local ratio of the two (slip). Jitter is the scatter of this
+    residual beyond the stated noise, divided by speed. It is 0 where it is small or unknown; a stationary robot has the
+    jitter of the nearest motion. The variance grows by (2 speed jitter)², because errors of successive late fixes are
+    correlated.
     """
     zero = int(gnss.stamp_ns[0])
     stamp_s, odometry_s = compute_seconds(gnss.stamp_ns, zero), compute_seconds(odometry.stamp_ns, zero)
@@ -176,14 +175,14 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
     if moving.sum() < _JITTER_STEPS:
         return gnss, np.zeros(stamp_s.size)
     driven_m, moved_m, mean_speed = driven_m[moving], moved_m[moving], driven_m[moving] / interval_s[moving]
-    # A median: neither slip nor an outlying fix is jitter.
+    # The median ignores slip and single outliers.
     residual_s = (moved_m - np.median(_make_windows(moved_m / driven_m), axis=1) * driven_m) / mean_speed
     claimed_m2 = gnss.variance_m2[:, :2].mean(1)
     claimed_s2 = _make_windows((claimed_m2[:-1] + claimed_m2[1:])[moving] / 2 / mean_speed**2).mean(1)
-    # One outlying fix spoils two pairs: the fourth fifth bears one in ten, yet sees tails that the median does not.
+    # One outlier affects two pairs: the 80 % quantile tolerates one outlier in ten, but includes tails.
     spread_s = np.quantile(_make_windows(np.abs(residual_s)), 0.8, axis=1) / 1.2816
     excess_s2 = spread_s**2 / 2 - claimed_s2
-    matters = excess_s2 > np.maximum(0.05**2, 4 * claimed_s2)  # less than 0.05 s does not matter
+    matters = excess_s2 > np.maximum(0.05**2, 4 * claimed_s2)  # ignore less than 0.05 s
     middle_s = (0.5 * (stamp_s[1:] + stamp_s[:-1]))[moving]
     jitter_s = np.interp(stamp_s, middle_s, np.sqrt(np.where(matters, excess_s2, 0.0)))
     variance = gnss.variance_m2.copy()
@@ -193,23 +192,24 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
 
 
 def inflate_late_fixes(gnss: Positions, late_s: float) -> Positions:
-    """Return fixes with variances raised where their receiver is late [s] and therefore probably filters its positions.
+    """Inflate the variances of fixes if their receiver is late by ``late_s``, since it probably filters its positions.
 
-    A first-order low-pass of time τ delays positions by τ; once that is corrected, they are off by τ² times the
-    acceleration. Correlation with speeds shows a delay below τ, so that the rest may be as long as the delay.
+    A first-order low-pass of time τ delays positions by τ. After correction of the delay, an error of τ² times the
+    acceleration remains. Correlation with speeds finds a delay below τ, so the remaining delay may be as large as the
+    found delay.
     """
-    if late_s < 0.2:  # such a receiver does not filter its positions [s]
+    if late_s < 0.2:  # [s]: no position filter
         return gnss
     axes = list(gnss.position_enu_m[:, :2].T)
     for _ in range(2):
-        axes = [compute_slopes(gnss.stamp_ns, axis, max(2.0 * late_s, 1.0)) for axis in axes]  # shortest [s]
+        axes = [compute_slopes(gnss.stamp_ns, axis, max(2.0 * late_s, 1.0)) for axis in axes]  # shortest window [s]
     variance = gnss.variance_m2.copy()
     variance[:, :2] += ((late_s**2 * np.hypot(*axes)) ** 2)[:, None]
     return replace(gnss, variance_m2=variance, unclaimed=np.ones(len(variance), np.bool_), lag_std_s=late_s)
 
 
 def _make_windows(values: Floats) -> Floats:
-    """Return the 41 values around each, shape (N, 41), mirrored at the ends."""
+    """Return the 41 values around each value, shape (N, 41), mirrored at the ends."""
     return np.lib.stride_tricks.sliding_window_view(np.pad(values, _JITTER_STEPS // 2, mode="reflect"), _JITTER_STEPS)
 
 
@@ -224,7 +224,7 @@ def prepare_ground_velocities(
     velocity, variance = velocity[usable], variance[usable]
     default = np.square(default_std_mps * np.array([1.0, 1.0, 2.0]))
     variance, replaced = _clean_variances(variance, default, _VELOCITY_FLOOR_MPS**2)
-    variance[np.isnan(velocity[:, 2]), 2] = NO_TRUST
+    variance[np.isnan(velocity[:, 2]), 2] = MAX_VARIANCE
     made = GroundVelocities(stamp_ns[usable], np.nan_to_num(velocity), variance)
     return made, Prepared(stamp_ns[~measured], repeated, replaced)
 
@@ -240,9 +240,9 @@ def prepare_body_velocities(
 ) -> tuple[BodyVelocities, Prepared]:
     """Prepare an odometry (columns of wheel_odometry or visual_odometry), whose child frame has the given extrinsics.
 
-    Its twist is used where it has one. One that has no forward velocity, or is zero throughout while the poses move, is
-    none: the velocity is then that of the increment from pose to pose, in the middle of the two stamps, in the axes
-    half-way between the two. Of wheels ``only_forward`` velocity, along base_link's x, is measured.
+    The twist is used if it is valid. A twist without forward velocity, or that is always zero while the poses move, is
+    invalid. Then the velocity comes from increments between poses, at the middle of two stamps and in the mean of the
+    two attitudes. Of wheels, ``only_forward`` velocity (along base_link's x) is measured.
     """
     pose = _stack_columns(columns, ("x_m", "y_m", "z_m"))
     velocity = _stack_columns(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
@@ -261,22 +261,22 @@ def prepare_body_velocities(
         if of_orientation[2] or not only_forward:
             rate = rates
             findings += _find_orientation_rates(of_orientation, subject)
-    turned = _rotate_vectors(rotation, velocity)
-    measured = np.isfinite(turned[:, 0]) & ~(np.abs(turned) >= _MAX_VELOCITY_MPS).any(1)
+    rotated = _rotate_vectors(rotation, velocity)
+    measured = np.isfinite(rotated[:, 0]) & ~(np.abs(rotated) >= _MAX_VELOCITY_MPS).any(1)
     usable, repeated = _select_usable_rows(stamp_ns, measured)
-    # Off-diagonal terms that the rotation makes are dropped.
+    # Off-diagonal terms by the rotation are ignored.
     variance = _rotate_vectors(rotation**2, variance[usable])
-    turned = turned[usable]
-    variance[np.isnan(turned)] = NO_TRUST
+    rotated = rotated[usable]
+    variance[np.isnan(rotated)] = MAX_VARIANCE
     variance, replaced = _clean_variances(variance, np.full(3, default_std_mps**2), _VELOCITY_FLOOR_MPS**2)
     turn_rate = _rotate_vectors(rotation, rate)[usable]
     if only_forward:
-        turned[:, 1:] = np.nan
+        rotated[:, 1:] = np.nan
         variance[:, 1:] = np.nan
-    else:  # an axis that is not measured is zero, to within anything
-        turned[np.isnan(turned)] = 0.0
+    else:  # an axis that is not measured: zero with a large variance
+        rotated[np.isnan(rotated)] = 0.0
     spatial = None if only_forward or not np.isfinite(turn_rate).all() else turn_rate
-    made = BodyVelocities(stamp_ns[usable], turned, variance, turn_rate[:, 2], xyz_m, spatial)
+    made = BodyVelocities(stamp_ns[usable], rotated, variance, turn_rate[:, 2], xyz_m, spatial)
     return made, Prepared(stamp_ns[~measured], repeated, replaced, tuple(findings))
 
 
@@ -288,8 +288,8 @@ def _find_orientation_rates(of_orientation: Mask, subject: Subject) -> list[Find
 def _rotate_vectors(matrix: Floats, values: Floats) -> Floats:
     """Return ``matrix`` (3, 3) times vectors (N, 3); an axis is NaN if an unmeasured component contributes to it."""
     unknown = np.isnan(values)
-    turned = np.where(unknown, 0.0, values) @ matrix.T
-    return np.where(unknown @ (np.abs(matrix).T > 0.1), np.nan, turned)  # cosine, 6°
+    rotated = np.where(unknown, 0.0, values) @ matrix.T
+    return np.where(unknown @ (np.abs(matrix).T > 0.1), np.nan, rotated)  # cosine: 6° off the axis
 
 
 def prepare_imu(
@@ -303,8 +303,8 @@ def prepare_imu(
 ) -> tuple[InertialMeasurements, Prepared]:
     """Prepare an IMU (columns of the role imu): rotate and move it to base_link, and check its specific force.
 
-    The noise is the one given or, where that is larger, that of the samples: motion too fast for the unit's rate counts
-    as noise.
+    The noise is the larger of the given noise and the noise of the samples, which includes motion too fast for the
+    unit's rate.
     """
     rate = _stack_columns(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     force = _stack_columns(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
@@ -337,12 +337,12 @@ def prepare_imu(
 
 
 def _iterate_slices(rows: int) -> Iterator[slice]:
-    """Yield slices of rows, so that temporary arrays stay small for a log of any length."""
+    """Yield slices of rows; they keep temporary arrays small for a log of any length."""
     return (slice(first, first + _SLICE_ROWS) for first in range(0, rows, _SLICE_ROWS))
 
 
 def _read_orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, float, float, float]) -> Floats:
-    """Return enu_from_base_link by the unit's own filter, shape (N, 4); NaN where it has none."""
+    """Return enu_from_base_link from the unit's own filter, shape (N, 4); NaN where it is missing."""
     components = [columns[name] for name in _QUAT]
     if any(np.isnan(component).all() for component in components):
         return np.broadcast_to(np.nan, (usable.size, 4))
@@ -370,7 +370,7 @@ def _move_to_base_link(stamp_ns: Ints, turn_radps: Floats, force_mps2: Floats, l
 
 
 def _estimate_local_noise(stamp_ns: Ints, values: Floats) -> Floats:
-    """Return the σ of white noise over two seconds around each sample, largest axis, shape (N,); 0 for few samples."""
+    """Return the σ of white noise in two seconds around each sample, largest axis, (N,); 0 for few samples."""
     largest = np.zeros(stamp_ns.size)
     for axis in values.T if stamp_ns.size > 2 else ():
         square = np.square(np.diff(axis, n=2))[:, None] / 6.0
@@ -383,7 +383,7 @@ def _stack_columns(columns: Columns, names: list[str] | tuple[str, ...]) -> Floa
 
 
 def _select_usable_rows(stamp_ns: Ints, good: Mask) -> tuple[Ints, int]:
-    """Return rows in order of time, one a stamp (the first of equals), and how many repeated one."""
+    """Return usable rows in order of time, the first of each stamp, and the number of rows with a repeated stamp."""
     rows = np.flatnonzero(good)
     if (np.diff(stamp_ns[rows]) > 0).all():
         return rows, 0
@@ -397,10 +397,10 @@ def _is_known(variance: Floats) -> Mask:
 
 
 def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[Floats, int]:
-    """Return usable variances (N, k), and the number of rows with a replaced one: default, or median if larger."""
+    """Return usable variances (N, k), and the number of replaced rows: default, or the median if larger."""
     known = _is_known(variance)
     usual = [np.median(axis[rows]) if rows.any() else 0.0 for axis, rows in zip(variance.T, known.T, strict=True)]
-    filled = np.clip(np.where(known, variance, np.maximum(default, usual)), floor, NO_TRUST)
+    filled = np.clip(np.where(known, variance, np.maximum(default, usual)), floor, MAX_VARIANCE)
     return filled, int((~known).any(1).sum())
 
 
@@ -408,21 +408,21 @@ _MAX_INCREMENT_S = 1.0  # longer increments give no velocity
 
 
 def has_twist(velocity_mps: Floats, pose_m: Floats) -> bool:
-    """Return whether the velocities are measurements: finite, and not all zero while the poses move."""
+    """Return whether the velocities are valid: finite, and not always zero while the poses move."""
     posed = pose_m[np.isfinite(pose_m).all(1)]
-    moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > 0.1  # m: less may be noise
+    moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > 0.1  # m: smaller changes may be noise
     return bool(np.isfinite(velocity_mps).any() and (np.nan_to_num(velocity_mps).any() or not moves))
 
 
 def compute_increments(stamp_ns: Ints, pose_m: Floats, quat_xyzw: Floats) -> tuple[Ints, Floats, Floats]:
-    """Return stamps, velocity and angular velocity in the child frame, in the middle of each two successive poses."""
+    """Return stamp, velocity and angular velocity (child frame) at the middle of each two successive poses."""
     posed = np.isfinite(np.hstack((pose_m, quat_xyzw))).all(axis=1)
     rows, _ = _select_usable_rows(stamp_ns, np.asarray(posed))
     stamp, position, quat = stamp_ns[rows], pose_m[rows], quat_xyzw[rows]
     step_ns = np.diff(stamp)
     step_s = np.asarray(step_ns, np.float64)[:, None] * 1e-9
     turn = compute_turns(quat)
-    # Half-way between two: the normalized sum of the quaternions of one hemisphere.
+    # Mean attitude: the normalized sum of both quaternions in one hemisphere.
     sign = np.where(np.sum(quat[:-1] * quat[1:], axis=-1, keepdims=True) < 0, -1.0, 1.0)
     velocity = rotate(invert(normalize(quat[:-1] + sign * quat[1:])), np.diff(position, axis=0)) / step_s
     near = step_s[:, 0] <= _MAX_INCREMENT_S
@@ -430,20 +430,20 @@ def compute_increments(stamp_ns: Ints, pose_m: Floats, quat_xyzw: Floats) -> tup
 
 
 def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Floats) -> tuple[Floats, Mask]:
-    """Return angular velocities, shape (N, 3), and which axes of them are by the orientation, shape (3,).
+    """Return angular velocities, shape (N, 3), and the axes that come from the orientation, shape (3,).
 
-    Those are the axes about which it turns while ``rate_radps``, in the child frame, is missing or zero throughout.
-    ``stamp_ns`` does not decrease; NaN is not measured.
+    The orientation gives an axis if it turns about it while ``rate_radps``, in the child frame, is missing or always
+    zero. ``stamp_ns`` does not decrease; NaN is not measured.
     """
     zero = (np.nan_to_num(rate_radps) == 0.0).all(axis=0)
     known = np.flatnonzero(np.isfinite(quat_xyzw).all(axis=1))
     known = known[np.concatenate(([True], np.diff(stamp_ns[known]) > 0))] if known.size else known
-    if not zero.any() or known.size < _FEWEST:
+    if not zero.any() or known.size < _MIN_COUNT:
         return rate_radps, np.zeros(3, np.bool_)
     stamp, quat = stamp_ns[known], quat_xyzw[known]
     turned_rad = np.cumsum(compute_turns(quat), axis=0)
     turns = zero & (np.ptp(turned_rad, axis=0) > 0.2)  # a larger turn contradicts zero [rad]
-    # Over two steps, so that the rate is that in the middle, at the stamp itself.
+    # Differences over two steps give the rate in the middle, at the stamp itself.
     step_s = (stamp[2:] - stamp[:-2])[:, None] * 1e-9
     rate = compute_turns(quat, 2) / step_s
     inner, near = known[1:-1], step_s[:, 0] <= _MAX_INCREMENT_S

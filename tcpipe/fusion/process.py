@@ -1,8 +1,9 @@
 """Process noise of the filters: noise densities, most of them estimated from the sensors themselves.
 
-White noise of standard deviation s at f Hz has the density s²/f. What changes along the drive is the density of the
-velocity's noise, one number an event. With an accelerometer it is that of its noise, which vibration multiplies while
-the robot moves. Without one, where the body velocity is held, it follows how fast the forward velocity changes there.
+White noise of standard deviation s at f Hz has the density s²/f. Only the density of the velocity's noise changes along
+the drive. With an accelerometer, it is the accelerometer's noise, which vibration multiplies while the robot moves.
+Without an accelerometer, the filter keeps the body velocity constant, and the density follows the measured change of
+forward velocity.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from tcpipe.fusion.signals import (
     compute_median_period_ns,
     compute_slopes,
     is_covered,
-    remove_wild_places,
+    remove_xy_spikes,
 )
 from tcpipe.fusion.state import Mode
 from tcpipe.robust import estimate_robust_std
@@ -29,25 +30,25 @@ SCALE_STD: Mapping[str, float] = {
     WHEELS: 0.12,  # slip of a skid-steered robot on grass
     VISUAL: 0.05,  # stereo calibration
 }
-"""By odometry, σ of its scale before the run shows it."""
+"""By odometry, prior σ of its scale [1]."""
 _TURN_SCALE_STD: Mapping[str, float] = {
     IMU: 0.01,  # MEMS gyroscopes, by their datasheets: 1 to 3 %
     WHEELS: 0.2,  # skidding wheels
     VISUAL: 0.03,  # camera
 }
-"""σ of the scale of a turn rate [1]."""
+"""By source, prior σ of the scale of its turn rate [1]."""
 SLOPE_RAD = 0.1  # slope of unknown ground [rad], 1σ
 UNSEEN_TURN_RADPS = 0.07  # roll and pitch rate on uneven ground [rad/s], 1σ
 GROUND = 2e-3  # density of the change of slope under a robot [rad²/m]: 2.6° over a metre
-_ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration [s]: one row
+_ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration [s]: one row of the track
 _MIN_DENSITY = 1e-4  # least density of velocity [m²/s³]: 1 cm/s in a second, forward and aside
-_UNKNOWN_DENSITY = 0.3  # density of velocity that no sensor shows [m²/s³]
+_UNKNOWN_DENSITY = 0.3  # density of velocity that no sensor measures [m²/s³]
 
 
-def turn_scale_std(measurements: Measurements) -> float:
-    """Return the standard deviation of the turn rate's scale: of the gyroscope, else of an odometry; else 0.
+def find_turn_scale_std(measurements: Measurements) -> float:
+    """Return the prior σ of the turn rate's scale: of the gyroscope, else of an odometry; else 0.
 
-    Without fixes nothing shows it: it stays 1.
+    Without fixes the scale is unobservable, and stays 1.
     """
     if measurements.gnss is None:
         return 0.0
@@ -58,9 +59,9 @@ def turn_scale_std(measurements: Measurements) -> float:
 
 
 def is_length_observable(m: Measurements, fixes: SensorNoise | None) -> bool:
-    """Return whether fixes determine the scale of odometry, by the ground that they span, twice as well as known.
+    """Return whether fixes determine the scale of odometry twice as well as its prior, by the distance that they span.
 
-    Else an accelerometer would show it, whose errors pass for a scale. The white noise of many fixes averages out.
+    Otherwise errors of an accelerometer would act as a scale. White noise of many fixes averages out.
     """
     if m.gnss is None or fixes is None or m.gnss.stamp_ns.size < 2:
         return False
@@ -70,15 +71,15 @@ def is_length_observable(m: Measurements, fixes: SensorNoise | None) -> bool:
 
 
 def find_best_scale_std(m: Measurements) -> float:
-    """Return the σ of the scale of the odometry whose scale is known best before the run shows it."""
+    """Return the smallest prior σ of the scales of odometries."""
     return SCALE_STD[WHEELS if m.visual is None else VISUAL]
 
 
 def find_scale_stds(measurements: Measurements, fixes: SensorNoise | None) -> Mapping[str, float]:
-    """Return the standard deviations of the scales of odometries by role; 0 where a scale is unobservable: it stays 1.
+    """Return the prior σ of the scales of odometries by role; 0 if a scale is unobservable, so that it stays 1.
 
-    Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else
-    the wheels. What an accelerometer adds up to over a minute is its tilt and its bias.
+    Only fixes make a scale observable: within a minute, integrated acceleration has the errors of tilt and bias.
+    Without fixes the camera is the reference, or the wheels if there is no camera.
     """
     if is_length_observable(measurements, fixes):
         return SCALE_STD
@@ -88,9 +89,9 @@ def find_scale_stds(measurements: Measurements, fixes: SensorNoise | None) -> Ma
 def make_motion_noise(  # noqa: PLR0917
     m: Measurements, noise: NoiseModel, stamp_ns: Ints, mode: NDArray[np.int8], rate_radps: Floats, period_s: float
 ) -> Floats:
-    """Return the variance added by motion over the tick before each stamp: rotation [rad²], velocity [m²/s²], (K, 6).
+    """Return the variance added by motion over the tick before each stamp: rotation [rad²], velocity [m²/s²]; (K, 6).
 
-    ``mode`` and ``rate_radps`` are those of the tick, as `tcpipe.fusion.state.move_state` takes them.
+    ``mode`` and ``rate_radps`` belong to the tick; see `tcpipe.fusion.state.move_state`.
     """
     density = np.zeros((stamp_ns.size, 6))
     by_gyro = mode >= Mode.GYRO_TURN
@@ -112,7 +113,7 @@ def make_motion_noise(  # noqa: PLR0917
 
 
 def _compute_speed(m: Measurements, at_ns: Ints) -> Floats:
-    """Return about how fast the robot drives [m/s]; 1 where only fixes show it."""
+    """Return the approximate speed of the robot [m/s]; 1 if only fixes measure it."""
     source = m.first_odometry
     if source is None:
         return np.ones(at_ns.size)
@@ -124,12 +125,12 @@ def _make_turn_density(
 ) -> Floats:
     """Return the noise density of turns that no gyroscope measures [rad²/s], shape (K, 3).
 
-    The scale of an odometry's turn rate is off by the variation of `PRIORS` for a second at a time, beside what is
-    constant of it.
+    The error of the scale of an odometry's turn rate has a constant part, and a part by `PRIORS` that lasts for a
+    second.
     """
     density = np.full((mode.size, 3), 5e-7)  # at least a tenth of a degree in a second
     ground = np.full(mode.size, 0.0 if m.is_antenna_alone else GROUND)
-    if not noise.turns and m.odometries():  # only the course over ground shows turns
+    if not noise.turns and m.odometries():  # only the course over ground measures turns
         density[:, 2] = 5e-3  # 4° in a second
     for role in noise.turns.keys() - {IMU}:
         rows = mode == (Mode.VISUAL_TURN if role == VISUAL else Mode.FLAT_TURN)
@@ -144,7 +145,7 @@ def _make_turn_density(
 def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:
     """Return the noise density without accelerometer: squared acceleration around a stamp times its duration.
 
-    Where two odometries differ, the one that shows the least of it is right: wheels that dig in show much.
+    If two odometries differ, the smaller density is right: wheels that slip in soft ground measure large accelerations.
     """
     sources = [source for source in m.odometries().values() if source.stamp_ns.size > 2]
     found = np.full(at_ns.size, np.nan)
@@ -159,8 +160,8 @@ def _compute_odometry_density(m: Measurements, at_ns: Ints) -> Floats:
 def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     """Return the noise density without odometry: squared acceleration of a receiver times its duration.
 
-    An acceleration between slow fixes lasts from one to the next. Fixes too noisy to show a velocity do not show how
-    steady it is.
+    An acceleration between slow fixes lasts from one fix to the next. If fixes are too noisy for a velocity, its change
+    is unknown.
     """
     source, least = m.doppler or m.gnss, 0.0
     if source is None or source.stamp_ns.size < 5:
@@ -168,26 +169,26 @@ def _compute_receiver_density(m: Measurements, at_ns: Ints) -> Floats:
     period_s = 1e-9 * compute_median_period_ns(source.stamp_ns)
     if isinstance(source, Positions):
         std, order = float(np.sqrt(np.median(source.variance_m2[:, :2]))), 2
-        velocity_std_mps = np.sqrt(12.0 / 5.0) * std / max(1.0, 5.0 * period_s)  # five fixes, for a second at least
-        least = _UNKNOWN_DENSITY * min(1.0, (velocity_std_mps / 0.5) ** 2)  # worse ones do not show its change
-        places = remove_wild_places(source.position_enu_m)
+        velocity_std_mps = np.sqrt(12.0 / 5.0) * std / max(1.0, 5.0 * period_s)  # five fixes, at least one second
+        least = _UNKNOWN_DENSITY * min(1.0, (velocity_std_mps / 0.5) ** 2)  # worse fixes do not resolve its change
+        places = remove_xy_spikes(source.position_enu_m)
         axes = [places.real, places.imag]
     else:
         std, order = float(np.sqrt(np.median(source.variance_m2ps2[:, :2]))), 1
         axes = [source.velocity_enu_mps[:, 0], source.velocity_enu_mps[:, 1]]
-    # The slope of a line through the samples of a window has √12 times their noise over √(samples), and over the
-    # window. It is to show 0.15 m/s², 1σ: half of the change that masks look for.
+    # The slope of a line through the samples of a window has σ = √12 times their noise / √(samples) / window. The
+    # window is chosen for 0.15 m/s², 1σ: half of the change that masks detect.
     window_s = max(3.0 * period_s, (12.0 ** (order / 2.0) * std * period_s**0.5 / 0.15) ** (1.0 / (order + 0.5)))
     for _ in range(order):
         axes = [compute_slopes(source.stamp_ns, axis, window_s) for axis in axes]
     acceleration = np.minimum(np.hypot(*axes), MAX_ACCELERATION_MPS2)
-    # Between two measurements it changes by 0.07 m/s², 1σ; it lasts for 0.2 s.
+    # The acceleration changes by 0.07 m/s², 1σ, between two measurements, and lasts for 0.2 s.
     density = np.maximum(max(0.2, period_s) * (0.07**2 + acceleration**2), least)
     return np.interp(at_ns, source.stamp_ns, density)
 
 
 def _estimate_slide_density(visual: BodyVelocities | None) -> float:
-    """Return the density of sideways and upward velocity [m²/s³]: as visual odometry shows it, or a guess."""
+    """Return the density of sideways and upward velocity [m²/s³] from visual odometry, or a default without it."""
     if visual is None or visual.stamp_ns.size < 3:
         return 4e-4
     shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], 1.0) for axis in (1, 2)]  # window [s]

@@ -1,14 +1,15 @@
-"""Backward pass of the error-state filter: its smoother.
+"""Backward pass of the error-state filter: the smoother.
 
-The smoother is that of Bryson and Frazier in the form of Bierman: it inverts no covariance, so parameters may be known
-exactly. Back in time over each update (gain K, innovation y of covariance S; G turns the axes of the error with the
-correction) and each motion F::
+This is the smoother of Bryson and Frazier in the form of Bierman. It inverts no covariance, so parameters may be known
+exactly. Steps back in time over each update (gain K, innovation y of covariance S; G rotates the axes of the error with
+the correction) and over each motion F::
 
     l ← G' l, Λ ← G' Λ G    l ← (I - K H)' l - H' S⁻¹ y,  Λ ← (I - K H)' Λ (I - K H) + H' S⁻¹ H    l ← F' l, Λ ← F' Λ F
-    x_s = x - P l    P_s = P - P Λ P    cov(d_j, d_k) = P_j (product of all transitions from j to k)' (I - Λ_k P_k),  j < k
+    x_s = x - P l    P_s = P - P Λ P    cov(d_j, d_k) = P_j (product of all transitions from j to k)' (I - Λ_k P_k),  j
+    < k
 
-On its way back the adjoint shows how much an event at a tick would explain. Restricted to the errors that the event
-changes, with S = diag(σ) of the change::
+At each tick the adjoint gives the log evidence of an event. Restricted to the errors that the event changes, with
+S = diag(σ) of the change::
 
     B = I + S Λ S    z = chol(B)⁻¹ S l    log evidence = |z|² / 2 - log |B| / 2    change = -S B⁻¹ S l
 
@@ -30,18 +31,18 @@ from tcpipe.fusion.state import KINDS, SIZES, Error, Matrix, Mode, N, Vector, di
 
 
 class Candidates(NamedTuple):
-    """Events whose evidence is wanted.
+    """Possible events, and the best tick of each.
 
     Attributes
     ----------
-    places, stds, sizes : by event, places in `Model.active` of the errors that it changes, standard deviations of the
-        change, (C, 9), and how many errors those are, (C,).
+    indices, stds, sizes : by event, indices in `Model.active` of the errors that it changes, standard deviations of the
+        change, (C, 9), and number of these errors, (C,).
     earliest : first tick of an event.
     best : by event, the largest log evidence of all ticks, its tick, the change, and its standard deviation, (C, 20);
     to be filled.
     """
 
-    places: Indices
+    indices: Indices
     stds: Matrix
     sizes: Indices
     earliest: int
@@ -55,32 +56,31 @@ class Smoothed(NamedTuple):
     ----------
     states : x, (K, 51).
     variances : of the position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], (K, 5).
-    links : variance of the horizontal displacement, along its direction, from a tick to the one each of the lags later
-        [m²], (K, l); NaN where it was not computed: it is to every `LINK_EVERY`-th tick.
-    spreads : standard deviation of every active error every `SELDOM` ticks, (K / SELDOM, n).
+    displacement_m2 : variance of the horizontal displacement, along its direction, from a tick to the tick one lag
+        later [m²], (K, l); NaN except at every `DISPLACEMENT_INTERVAL_TICKS`-th tick.
+    stds : standard deviation of every active error, every `STD_INTERVAL` ticks, (K / STD_INTERVAL, n).
     """
 
     states: Matrix
     variances: Matrix
-    links: Matrix
-    spreads: Matrix
+    displacement_m2: Matrix
+    stds: Matrix
 
 
-LINK_EVERY, SELDOM = 10, 100
-LARGEST_EVENT = 9
-"""Errors that an event changes, at most."""
+DISPLACEMENT_INTERVAL_TICKS, STD_INTERVAL = 10, 100
+LARGEST_EVENT = 9  # largest number of errors that an event changes
 
 
 class Adjoint(NamedTuple):
-    """State of the smoother on its way back in time.
+    """State of the smoother, which runs back in time.
 
     Attributes
     ----------
     information : Λ, (n, n).
-    rows : l, and for each of Q ticks ahead the columns of I - Λ P that belong to its position east and north, (1 + 2 Q,
+    rows : l, and for each of Q later ticks the columns of I - Λ P of its position east and north, (1 + 2 Q,
     n).
-    ticks : of those ticks, (Q,); -1: none. Every `LINK_EVERY` as far as the longest lag.
-    ends : of those ticks, position east and north, and their smoothed covariance (ee, en, nn), (Q, 5).
+    ticks : indices of these Q ticks, (Q,); -1: none. Every `DISPLACEMENT_INTERVAL_TICKS`-th tick up to the longest lag.
+    ends : positions east and north at these ticks, and their smoothed covariance (ee, en, nn), (Q, 5).
     """
 
     information: Matrix
@@ -91,7 +91,7 @@ class Adjoint(NamedTuple):
 
 def make_adjoint(size: int, longest: int) -> Adjoint:
     """Return the adjoint at the last tick, of ``size`` errors, for lags up to ``longest`` ticks (0: none)."""
-    ahead = longest // LINK_EVERY + 1 if longest else 0
+    ahead = longest // DISPLACEMENT_INTERVAL_TICKS + 1 if longest else 0
     rows = np.zeros((1 + 2 * ahead, size))
     return Adjoint(np.zeros((size, size)), rows, np.full(ahead, -1, np.int64), np.zeros((ahead, 5)))
 
@@ -100,7 +100,7 @@ def make_adjoint(size: int, longest: int) -> Adjoint:
 def step_before_update(
     K: Matrix, H: Matrix, size: int, pull: Vector, inverse: Matrix, turn: Vector, adjoint: Adjoint, B: Matrix
 ) -> None:
-    """Take the adjoint back over one update."""
+    """Propagate the adjoint back over one update."""
     information, rows = adjoint.information, adjoint.rows
     n = information.shape[0]
     turn_rows(rows.T, turn, rows.shape[0], True)
@@ -143,8 +143,8 @@ def step_before_update(
 
 
 @compile_kernel
-def step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint: Adjoint, W: Matrix) -> None:
-    """Take the adjoint back over the motion of a tick."""
+def step_before_motion(F: Matrix, kept: Vector, indices: Indices, m: int, adjoint: Adjoint, W: Matrix) -> None:
+    """Propagate the adjoint back over the motion of a tick."""
     information, rows = adjoint.information, adjoint.rows
     n = information.shape[0]
     for i in range(n):
@@ -155,28 +155,28 @@ def step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint
             rows[:, i] *= f
     for r in range(rows.shape[0]):
         for a in range(m):
-            W[0, a] = rows[r, places[a]]
+            W[0, a] = rows[r, indices[a]]
         for b in range(m):
             s = 0.0
             for a in range(m):
                 s += F[a, b] * W[0, a]
-            rows[r, places[b]] = s
+            rows[r, indices[b]] = s
     for _ in range(2):  # F' from the left, twice: Λ is symmetric
         W[:m] = 0.0
         for a in range(m):
             for b in range(m):
                 f = F[a, b]
                 for j in range(n):
-                    W[b, j] += f * information[places[a], j]
+                    W[b, j] += f * information[indices[a], j]
         for b in range(m):
-            information[places[b]] = W[b]
+            information[indices[b]] = W[b]
         for i in range(n):
             for j in range(i):
                 s = information[i, j]
                 information[i, j] = information[j, i]
                 information[j, i] = s
-    # The step over an update takes Λ for symmetric: an asymmetry by rounding would grow to the size of Λ within half an
-    # hour.
+    # The step over an update assumes that Λ is symmetric: without this, an asymmetry by rounding would grow to the size
+    # of Λ within half an hour.
     for i in range(n):
         for j in range(i):
             information[i, j] = information[j, i] = 0.5 * (information[i, j] + information[j, i])
@@ -184,7 +184,7 @@ def step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint
 
 @compile_kernel
 def _turn_covariance(x: Vector, c: Matrix, axis: int, other: int) -> float:
-    """Return the covariance of the positions along two axes of ENU, of errors along those of the state."""
+    """Return the covariance of positions along two ENU axes from the covariance along axes of the state."""
     s = 0.0
     for i in range(3):
         for j in range(3):
@@ -215,8 +215,8 @@ def _smooth_tick(
             s -= P[i, j] * rows[0, j]
         d[model.active[i]] = s
     displace_state(x, d, 1.0, out.states[k], turn)
-    # The covariance of rotation, position and velocity; of all errors now and then.
-    count = n if k % SELDOM == 0 else 9
+    # Covariance of rotation, position and velocity; of all errors only every `STD_INTERVAL` ticks.
+    count = n if k % STD_INTERVAL == 0 else 9
     for i in range(n):
         if i >= count and not model.mount <= i < model.mount + 3:
             continue
@@ -230,7 +230,7 @@ def _smooth_tick(
             s = P[i, i]
             for j in range(n):
                 s -= A[i, j] * P[j, i]
-            out.spreads[k // SELDOM, i] = sqrt(max(s, 0.0))
+            out.stds[k // STD_INTERVAL, i] = sqrt(max(s, 0.0))
     size = 9 if model.mount < 0 else 12
     for i in range(size):
         row = i if i < 9 else model.mount + i - 9
@@ -240,7 +240,7 @@ def _smooth_tick(
             for b in range(n):
                 s -= A[row, b] * P[b, column]
             c[i, j] = s
-    for i in range(3, size - 6):  # the robot turns with the IMU and with its mounting
+    for i in range(3, size - 6):  # the robot's rotation error: that of the IMU plus that of its mounting
         for j in range(size):
             c[i - 3, j] += c[6 + i, j]
     for i in range(3, size - 6):
@@ -258,7 +258,7 @@ def _smooth_tick(
             if ticks[q] < 0 or ticks[q] - k != lags[column]:
                 continue
             east, north = ends[q, 0] - out.states[k, 9], ends[q, 1] - out.states[k, 10]
-            short = 0.5 * 0.01 * 0.01  # m²: where the robot hardly moves, along any direction
+            short = 0.5 * 0.01 * 0.01  # m²: if the robot hardly moves, the direction is arbitrary
             share = (east * east + short, 2.0 * east * north, north * north + short)
             s = 0.0
             for axis in range(2):
@@ -271,9 +271,9 @@ def _smooth_tick(
                             v -= line[j] * x[3 * other + i] * rows[1 + 2 * q + axis, j]
                     s += share[axis + other] * v
             s /= east * east + north * north + 2.0 * short
-            out.links[k, column] = max(s, 0.0)
-    if ticks.size and k % LINK_EVERY == 0:
-        q = (k // LINK_EVERY) % ticks.size
+            out.displacement_m2[k, column] = max(s, 0.0)
+    if ticks.size and k % DISPLACEMENT_INTERVAL_TICKS == 0:
+        q = (k // DISPLACEMENT_INTERVAL_TICKS) % ticks.size
         ticks[q] = k
         ends[q, 0], ends[q, 1] = out.states[k, 9], out.states[k, 10]
         for axis in range(2):
@@ -292,25 +292,25 @@ def _smooth_tick(
 
 @compile_kernel
 def _score_events(k: int, adjoint: Adjoint, candidates: Candidates, B: Matrix, L: Matrix) -> None:
-    """Keep what events at tick k explain, where that is more than at later ticks."""
-    places, stds, sizes, _, best = candidates
+    """Store the evidence of events at tick k, if it exceeds the evidence at later ticks."""
+    indices, stds, sizes, _, best = candidates
     for c in range(sizes.size):
         m = sizes[c]
         for a in range(m):
             for b in range(a + 1):
-                B[a, b] = stds[c, a] * adjoint.information[places[c, a], places[c, b]] * stds[c, b]
+                B[a, b] = stds[c, a] * adjoint.information[indices[c, a], indices[c, b]] * stds[c, b]
             B[a, a] += 1.0
         factorize(B, np.arange(m), m, L)
         evidence = 0.0
         for a in range(m):
-            s = stds[c, a] * adjoint.rows[0, places[c, a]]
+            s = stds[c, a] * adjoint.rows[0, indices[c, a]]
             for b in range(a):
                 s -= L[a, b] * B[b, m]
             B[a, m] = s / L[a, a]
             evidence += 0.5 * B[a, m] ** 2 - log(L[a, a])
         if evidence > best[c, 0]:
             best[c, 0], best[c, 1] = evidence, k
-            for a in range(m):  # rows of chol(B)⁻¹, and with them the diagonal of S B⁻¹ S
+            for a in range(m):  # rows of chol(B)⁻¹ give the diagonal of S B⁻¹ S
                 best[c, 2 + a] = best[c, 2 + LARGEST_EVENT + a] = 0.0
                 for b in range(a + 1):
                     s = 1.0 if a == b else 0.0
@@ -340,11 +340,11 @@ def smooth_ticks(
 
     Parameters
     ----------
-    steps : of these ticks, as `filter_ticks` filled them.
-    lags : ticks over which displacements are wanted.
-    adjoint : of tick ``last`` before its motion; becomes that of ``first`` before its motion.
-    candidates : events to be scored at these ticks.
-    out : filled for these ticks.
+    steps : of these ticks, filled by `filter_ticks`.
+    lags : durations of displacements, in ticks.
+    adjoint : at tick ``last`` before its motion; becomes the adjoint at ``first`` before its motion.
+    candidates : events whose evidence is computed at these ticks.
+    out : output for these ticks.
     """
     n = adjoint.information.shape[0]
     A, B = np.zeros((n, n)), np.zeros((3, 2 * n + 3))
@@ -363,5 +363,5 @@ def smooth_ticks(
             _score_events(k, adjoint, candidates, C, L)
         if k > 0:
             motion = KINDS + (inputs.mode[k] >= Mode.GYRO_TURN)
-            places, m = model.depends[motion], model.counts[motion]
-            step_before_motion(steps.F[row], steps.kept[row], places, m, adjoint, A)
+            indices, m = model.depends[motion], model.counts[motion]
+            step_before_motion(steps.F[row], steps.kept[row], indices, m, adjoint, A)

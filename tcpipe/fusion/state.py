@@ -10,8 +10,8 @@ subtracted)::
 
     R⁺ = R D    p⁺ = p + R (u T + s) + g T² / 2    u⁺ = D' (u + R' g T + v)
 
-so an unknown tilt does not shorten the path, and a constant velocity of the body stays one while it turns. Without a
-usable accelerometer ``u`` is kept.
+so an unknown tilt does not shorten the path, and a constant body velocity stays constant while the robot turns. Without
+a usable accelerometer ``u`` is constant.
 
 Layout: ``x`` is flat, R row by row in 0:9; entry e of the errors (e >= 3) is entry e + 6 of ``x``.
 
@@ -33,11 +33,11 @@ from tcpipe.compiled import compile_kernel
 GRAVITY_MPS2 = 9.80665  # standard gravity (CGPM 1901)
 
 N, MOVING, NX = 45, 15, 51
-"""Number of errors; of those that move with the robot (from `Error.ARM` on they stay or decay); of state entries."""
+"""Numbers of errors, of errors that motion changes (those before `Error.ARM`; others decay), and of state entries."""
 
 
 class Error(IntEnum):
-    """First place of each part of the errors; `tcpipe.fusion.parameters.PARAMETERS` has the meaning from ``ARM`` on."""
+    """First index of each block of errors; from ``ARM`` on see `tcpipe.fusion.parameters.PARAMETERS`."""
 
     THETA, RHO, U, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
     ARM, FIX_LAG, FIX_ERROR, FIX_OFFSET = 15, 18, 19, 22
@@ -49,20 +49,19 @@ class Error(IntEnum):
 class Kind(IntEnum):
     """Kinds of measurements.
 
-    SIDEWAYS: sideways and upward velocity of the turning centre are about zero; STATIONARY: the velocity, and
-    STATIONARY_RATE: the gyroscope's rate less its bias; LEVEL: roll and pitch are small; ATTITUDE: that of a pose.
+    SIDEWAYS: sideways and upward velocity of the turning centre are about zero. STATIONARY: the velocity is zero.
+    STATIONARY_RATE: the gyroscope's rate is its bias. LEVEL: roll and pitch are small. ATTITUDE: attitude of a pose.
     """
 
     WHEELS, SIDEWAYS, VISUAL, STATIONARY, STATIONARY_RATE, LEVEL, DOPPLER, FIX, ATTITUDE = range(9)
 
 
 KINDS = len(Kind)
-SIZES = (1, 2, 3, 3, 3, 2, 3, 3, 3)
-"""Components of each kind of measurement."""
+SIZES = (1, 2, 3, 3, 3, 2, 3, 3, 3)  # number of components of each kind of measurement
 
 
 class Mode(IntEnum):
-    """Source of motion over a tick: turn of wheels or course, of a camera, a gyroscope, or a whole IMU."""
+    """Source of motion over a tick: turn rate of wheels or course, of a camera, of a gyroscope, or a complete IMU."""
 
     FLAT_TURN, VISUAL_TURN, GYRO_TURN, INERTIAL = range(4)
 
@@ -101,7 +100,7 @@ def multiply_rotations(left: Vector, right: Vector, out: Vector) -> None:
 
 @compile_kernel
 def displace_state(x: Vector, d: Vector, sign: float, out: Vector, turn: Vector) -> None:
-    """Fill ``out`` with the state that lies ``sign * d`` off ``x``; ``turn`` is room for 9."""
+    """Fill ``out`` with the state ``x`` displaced by ``sign * d``; ``turn`` is a work array of 9."""
     make_rotation(sign * d[0], sign * d[1], sign * d[2], turn)
     multiply_rotations(x, turn, out)
     for i in range(3):
@@ -113,7 +112,7 @@ def displace_state(x: Vector, d: Vector, sign: float, out: Vector, turn: Vector)
 
 @compile_kernel
 def compute_rotation_error(y: Vector, x: Vector, out: Vector) -> None:
-    """Fill the first 3 of ``out`` with the rotation vector from ``x`` to ``y``, whose first 9 are rotation matrices."""
+    """Fill ``out[:3]`` with the rotation vector from ``x`` to ``y``; both begin with a rotation matrix of 9 entries."""
     a = b = c = 0.0
     trace = -1.0
     for k in range(3):  # antisymmetric part and trace of Rx' Ry
@@ -132,7 +131,7 @@ def compute_rotation_error(y: Vector, x: Vector, out: Vector) -> None:
 
 @compile_kernel
 def compute_moving_error(y: Vector, x: Vector, out: Vector) -> None:
-    """Fill the first `MOVING` of ``out`` with the error of ``y`` against ``x``."""
+    """Fill the first `MOVING` of ``out`` with the error of ``y`` relative to ``x``."""
     compute_rotation_error(y, x, out)
     for j in range(3):
         out[Error.RHO + j] = x[j] * (y[9] - x[9]) + x[3 + j] * (y[10] - x[10]) + x[6 + j] * (y[11] - x[11])
@@ -145,7 +144,7 @@ def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, o
     """Fill ``out`` with the state after a tick of T seconds.
 
     ``turned``: rotation matrix over the tick by the gyroscope, or the rotation vector by an odometry; ``gained``:
-    velocity and displacement by the accelerometer, shape (6,). Both with the biases and the scale still in them.
+    velocity and displacement by the accelerometer, shape (6,). Both contain the biases and the scale.
     """
     if mode >= Mode.GYRO_TURN:
         s = 0.5 * x[Error.TURN_SCALE + 6]  # half of the antisymmetric part is the rotation vector of a small turn
@@ -168,7 +167,7 @@ def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, o
         s0 += gained[3] - h * T * a0
         s1 += gained[4] - h * T * a1
         s2 += gained[5] - h * T * a2
-        # The forces were turned by a rate that still held its bias.
+        # The forces were rotated with a rate that still contains its bias.
         v0, v1, v2 = v0 - h * (b1 * v2 - b2 * v1), v1 - h * (b2 * v0 - b0 * v2), v2 - h * (b0 * v1 - b1 * v0)
         u0 += v0 - T * (a0 + GRAVITY_MPS2 * x[6])
         u1 += v1 - T * (a1 + GRAVITY_MPS2 * x[7])
@@ -176,7 +175,7 @@ def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, o
         fall = 0.5 * GRAVITY_MPS2 * T * T
         for j in range(3):
             out[Error.U + 6 + j] = turn[j] * u0 + turn[3 + j] * u1 + turn[6 + j] * u2
-    else:  # the body keeps its velocity: half of the turn on the way
+    else:  # constant body velocity: the path has half of the turn
         out[Error.U + 6], out[Error.U + 7], out[Error.U + 8] = u0, u1, u2
         m0 = s0 + turn[0] * s0 + turn[1] * s1 + turn[2] * s2
         m1 = s1 + turn[3] * s0 + turn[4] * s1 + turn[5] * s2
@@ -210,11 +209,11 @@ def _predict_attitude(x: Vector, w0: float, w1: float, w2: float, t: float, meas
 def predict_measurement(
     kind: int, x: Vector, rate: Vector, has_gyro: bool, acceleration: Vector, tau: float, lever: Vector, out: Vector
 ) -> None:  # fmt: skip
-    """Fill ``out`` with what a sensor measures of a state.
+    """Fill ``out`` with the measurement of a state by a sensor.
 
     ``rate``: angular velocity at the tick, bias or scale not removed; ``acceleration``: time derivative of ``u``;
-    ``tau``: time of the measurement after the tick [s]; ``lever``: place of an odometry on the robot. A pose measures
-    its own attitude, the rotation vector ``lever``: what is predicted is the rotation from there.
+    ``tau``: time of the measurement after the tick [s]; ``lever``: lever arm of an odometry [m]. For a pose, ``lever``
+    is its measured attitude as a rotation vector, and the prediction is the rotation from it.
     """
     if kind == Kind.STATIONARY:
         out[0], out[1], out[2] = x[Error.U + 6], x[Error.U + 7], x[Error.U + 8]
@@ -232,12 +231,12 @@ def predict_measurement(
             rate[1] - x[Error.GYRO_BIAS + 7],
             rate[2] - x[Error.GYRO_BIAS + 8],
         )
-    else:  # beside a lever arm the noise of the rate would look like a scale
+    else:  # with a lever arm, the noise of the rate would act as a scale
         w0, w1, w2 = rate[0], rate[1], rate[2]
     if kind == Kind.ATTITUDE:
         _predict_attitude(x, w0, w1, w2, tau - x[Error.FIX_LAG + 6], lever, out)
         return
-    if kind >= Kind.DOPPLER:  # the antenna's place turned by the mounting of the IMU, whose axes are the state's
+    if kind >= Kind.DOPPLER:  # lever arm in the axes of the IMU, which are the state's
         a0, a1, a2 = x[Error.ARM + 6], x[Error.ARM + 7], x[Error.ARM + 8]
         a0, a1, a2 = a0 + m1 * a2 - m2 * a1, a1 + m2 * a0 - m0 * a2, a2 + m0 * a1 - m1 * a0
         t = tau - x[Error.FIX_LAG + 6]
@@ -265,7 +264,7 @@ def predict_measurement(
         x[Error.U + 7] + t * acceleration[1],
         x[Error.U + 8] + t * acceleration[2],
     )
-    # From the axes of the IMU to those of the robot.
+    # Rotate from the axes of the IMU to those of the robot.
     v0, v1, v2 = u0 - m1 * u2 + m2 * u1, u1 - m2 * u0 + m0 * u2, u2 - m0 * u1 + m1 * u0
     w0, w1, w2 = w0 - m1 * w2 + m2 * w1, w1 - m2 * w0 + m0 * w2, w2 - m0 * w1 + m1 * w0
     v0 += w1 * lever[2] - w2 * lever[1]

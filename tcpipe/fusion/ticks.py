@@ -1,12 +1,12 @@
 """Measurements of a section by tick of the track: motion between ticks, and the mean of each sensor at each tick.
 
-Ticks are the multiples of the track's period, or of a part of it that is at most 50 ms long. A sensor that measures
-several times a tick gives the mean of value and stamp. Late messages are no problem offline: everything is in order of
-its stamp of measurement.
+Ticks are the multiples of the track's period, or of a fraction of it of at most 50 ms. If a sensor measures several
+times in a tick, values and stamps are averaged. All measurements are sorted by stamp of measurement, so messages that
+arrive late need no special treatment.
 
-Two constraints are measurements of our own making: the turning centre of the robot moves neither sideways nor upward;
-and a robot that is stationary (`tcpipe.fusion.initial`) has no velocity, and its gyroscope shows its bias. Where no
-accelerometer shows up and down, roll and pitch are small.
+tcpipe adds constraints as measurements: the turning centre of the robot moves neither sideways nor upward, and a
+stationary robot (`tcpipe.fusion.initial`) has no velocity, so its gyroscope measures its bias. Without an
+accelerometer, roll and pitch are small.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tcpipe.fusion import state
 from tcpipe.fusion.densities import PRIORS, NoiseModel
 from tcpipe.fusion.filter_kernel import FilterModel, Memory, Tests, TickInputs
 from tcpipe.fusion.level_motion import COURSE, get_turn_rates
-from tcpipe.fusion.measurements import IMU, NO_TRUST, VISUAL, WHEELS, BodyVelocities, Measurements
+from tcpipe.fusion.measurements import IMU, MAX_VARIANCE, VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import UNSEEN_TURN_RADPS, make_motion_noise
 from tcpipe.fusion.signals import (
     compute_interval_means,
@@ -46,8 +46,8 @@ class Ticks:
 
     Attributes
     ----------
-    stamp_ns : [ns], shape (K,). inputs : what the filter takes.
-    rows : by kind of measurement, the tick of each row of its sensor; -1: of none.
+    stamp_ns : [ns], shape (K,). inputs : inputs of the filter.
+    rows : by kind of measurement, the tick of each row of its sensor; -1: none.
     fix_variance_m2 : variance of the fixes' correlated error at each tick [m²], (K, 3).
     """
 
@@ -69,7 +69,7 @@ class Pass:
 
 
 def find_tick_period_ns(period_ns: int) -> int:
-    """Return the time of a tick [ns]: a whole part of the track's period, at most 50 ms."""
+    """Return the time between ticks [ns]: the track's period divided by an integer, at most 50 ms."""
     return period_ns // -(-period_ns // _LONGEST_NS)
 
 
@@ -78,7 +78,7 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
 ) -> Ticks:
     """Return the ticks from before ``start_ns`` to after ``end_ns``; ``stationary_ns``, shape (S, 2), are stops [ns].
 
-    Every wanted stamp (``output_ns``, multiples of the track's period) is a tick.
+    Every output stamp (``output_ns``, multiples of the track's period) is a tick.
     """
     tick_ns = find_tick_period_ns(compute_median_period_ns(output_ns) if output_ns.size > 1 else _LONGEST_NS)
     stamp_ns = np.arange(start_ns // tick_ns, -(-end_ns // tick_ns) + 1, dtype=np.int64) * tick_ns
@@ -88,17 +88,18 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
     variance, tau, levers = np.ones_like(value), np.zeros((size, state.KINDS)), np.zeros((state.KINDS, 3))
     rows: dict[int, Ints] = {}
 
-    def put(kind: int, source_ns: Ints, values: Floats, variances: Floats) -> None:
-        at = np.rint((source_ns - stamp_ns[0]) / tick_ns).astype(np.int64)
-        inside = (at >= 0) & (at < size)
-        rows[kind] = np.where(inside, at, -1)
-        at, values, variances = at[inside], values[inside], variances[inside]
-        offset_s = (source_ns[inside] - stamp_ns[at]) * 1e-9
-        count = np.bincount(at, minlength=size)
+    def add_means(kind: int, source_ns: Ints, values: Floats, variances: Floats) -> None:
+        """Write the mean of a sensor's values, variances and time offsets at each tick."""
+        tick = np.rint((source_ns - stamp_ns[0]) / tick_ns).astype(np.int64)
+        inside = (tick >= 0) & (tick < size)
+        rows[kind] = np.where(inside, tick, -1)
+        tick, values, variances = tick[inside], values[inside], variances[inside]
+        offset_s = (source_ns[inside] - stamp_ns[tick]) * 1e-9
+        count = np.bincount(tick, minlength=size)
         has_samples, width = count > 0, values.shape[1]
 
         def mean(samples: Floats) -> Floats:
-            return np.bincount(at, samples, size)[has_samples] / count[has_samples]
+            return np.bincount(tick, samples, size)[has_samples] / count[has_samples]
 
         for axis in range(width):
             value[has_samples, kind, axis] = mean(values[:, axis])
@@ -109,29 +110,33 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
         if source is not None:
             levers[kind] = source.lever_arm_m
             axes = 1 if kind == Kind.WHEELS else 3
-            put(kind, source.stamp_ns, source.velocity_mps[:, :axes], _make_velocity_variance(m, source, noise, role))
+            add_means(
+                kind, source.stamp_ns, source.velocity_mps[:, :axes], _make_velocity_variance(m, source, noise, role)
+            )
     fix_variance = np.zeros((size, 3))
     if m.gnss is not None:
         white, correlated = _compute_shares(noise)
-        put(Kind.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * white)
+        add_means(Kind.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * white)
         nearest = np.searchsorted(m.gnss.stamp_ns, stamp_ns).clip(0, m.gnss.stamp_ns.size - 1)
         fix_variance = m.gnss.variance_m2[nearest] * correlated
     attitude = np.zeros((size, 3))
     if m.gnss is not None and m.gnss.quat_xyzw is not None and m.gnss.rotation_variance_rad2 is not None:
         measured = np.where(np.isfinite(m.gnss.quat_xyzw).all(1), rows[Kind.FIX], -1)
         known = np.flatnonzero(measured >= 0)
-        at, first = np.unique(measured[known], return_index=True)  # rotations have no mean: one a tick
+        tick, first = np.unique(measured[known], return_index=True)  # rotations are not averaged: one per tick
         chosen = known[first]
-        attitude[at] = rotation_vector_from_quat(m.gnss.quat_xyzw[chosen])
-        put(Kind.ATTITUDE, m.gnss.stamp_ns[chosen], np.zeros((at.size, 3)), m.gnss.rotation_variance_rad2[chosen])
+        attitude[tick] = rotation_vector_from_quat(m.gnss.quat_xyzw[chosen])
+        add_means(
+            Kind.ATTITUDE, m.gnss.stamp_ns[chosen], np.zeros((tick.size, 3)), m.gnss.rotation_variance_rad2[chosen]
+        )
         rows[Kind.ATTITUDE] = measured
     if m.gnss is not None and m.doppler is not None:
-        # Weight of a correlation that fades in 1.5 s.
+        # Weight of an error with a correlation time of 1.5 s.
         lasting = max(1.0, 3.0 * 1e9 / compute_median_period_ns(m.doppler.stamp_ns))
         variances = m.doppler.variance_m2ps2 * lasting
         if not m.has_tilt:
             variances = variances + _compute_unseen_turn_variance(m.doppler.stamp_ns, m.gnss.lever_arm_m)
-        put(Kind.DOPPLER, m.doppler.stamp_ns, m.doppler.velocity_enu_mps, variances)
+        add_means(Kind.DOPPLER, m.doppler.stamp_ns, m.doppler.velocity_enu_mps, variances)
     _add_constraints(m, stationary_ns, stamp_ns, value, variance, period_s=period_s)
     if m.wheels is not None:
         levers[Kind.SIDEWAYS] = m.wheels.lever_arm_m
@@ -171,14 +176,14 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
 
 
 def _compute_shares(noise: NoiseModel) -> tuple[Floats, Floats]:
-    """Return white and correlated share of the claimed variance of fixes, each east, north, up."""
+    """Return the white and the correlated share of the claimed variance of fixes, each east, north, up."""
     axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
     shares = np.array([(fix.white / fix.claimed_m2, fix.correlated.variance / fix.claimed_m2) for fix in axes])
     return shares[:, 0], shares[:, 1]
 
 
 def _make_fix_process(noise: NoiseModel, variance_m2: Floats, period_s: float) -> tuple[Floats, Floats]:
-    """Return the share of the fixes' correlated error that stays over each tick, and the variance added to it."""
+    """Return the decay factor of the fixes' correlated error over each tick, and the variance added to it."""
     size = variance_m2.shape[0]
     if noise.horizontal is None:
         return np.ones(size), np.zeros((size, 3))
@@ -189,26 +194,26 @@ def _make_fix_process(noise: NoiseModel, variance_m2: Floats, period_s: float) -
 
 
 def compute_process_noise(kept: Floats, variance: Floats) -> Floats:
-    """Return what is added over each tick to a process of this variance, (K, 3), of which the share ``kept`` stays."""
+    """Return the variance added in each tick to a process with this variance and decay factor ``kept``, (K, 3)."""
     before = np.concatenate((variance[:1], variance[:-1]))
     return np.maximum(variance - kept[:, None] ** 2 * before, 0.0)
 
 
 def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: NoiseModel, role: str) -> Floats:
-    """Return each sample's variance: forward by the run's noise, more if it claims more than usual; else as claimed."""
+    """Return each sample's variance: forward from the run, larger if its claim is unusual; other axes as claimed."""
     rate_hz = 1e9 / compute_median_period_ns(source.stamp_ns)
     claimed = source.variance_m2ps2
     found = claimed.copy()
     relative = claimed[:, 0] / np.median(claimed[:, 0])
     speed_mps, of_run = source.velocity_mps[:, 0], noise.odometries[role]
-    # The scatter of the samples of a moving robot around their neighbours', by the median: wild ones do not move it.
+    # Scatter of the samples of a moving robot around their neighbours; the median ignores outliers.
     second = np.diff(speed_mps, n=2)[(np.abs(speed_mps) > 0.05)[1:-1]]
     scatter = estimate_robust_std(second) ** 2 / 6.0 if second.size > 1 else 0.0
-    density = max(of_run.white, PRIORS[f"{role} velocity"].variance)  # the mean of a tick is no better
+    density = max(of_run.white, PRIORS[f"{role} velocity"].variance)  # lower bound for the mean of a tick
     found[:, 0] = max(density * rate_hz, scatter) * np.maximum(relative, 1.0)
     for axis in range(1, 3):
         if not np.isfinite(claimed[:, axis]).all() or np.ptp(source.velocity_mps[:, axis]) == 0.0:
-            found[:, axis] = NO_TRUST  # an axis that is always zero is a constraint, not a measurement
+            found[:, axis] = MAX_VARIANCE  # an axis that is always zero is a constraint, not a measurement
     flat = source.turn_rate_radps is None and m.imu is None and role == VISUAL
     if flat:
         found = found + _compute_unseen_turn_variance(source.stamp_ns, source.lever_arm_m)
@@ -216,7 +221,7 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
 
 
 def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, float, float]) -> Floats:
-    """Variance [m²/s²], (3,), of unmeasured turns at a sensor off base_link; such turns last for a second."""
+    """Return the velocity variance [m²/s²], (3,), by unmeasured turns at a lever arm; such turns last for a second."""
     x, y, z = np.square(lever_arm_m)
     lasting = max(1.0, 1e9 / compute_median_period_ns(stamp_ns))
     return np.array([z, z, x + y]) * UNSEEN_TURN_RADPS**2 * lasting
@@ -225,17 +230,16 @@ def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, floa
 def _add_constraints(
     m: Measurements, stationary_ns: Ints, stamp_ns: Ints, value: Floats, variance: Floats, *, period_s: float
 ) -> None:
-    if m.is_antenna_alone:  # which way the body looks is not known
+    if m.is_antenna_alone:  # the direction of the body is unknown
         return
     value[:, Kind.SIDEWAYS, :2] = 0.0
-    # Sideways velocities are independent after 16 ms: what lasts longer of them is in the states of turning centre and
-    # mounting.
+    # Sideways velocities are independent after 16 ms; slower ones are in the states of turning centre and mounting.
     variance[:, Kind.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * 0.016 / period_s
     imu = m.imu
     if imu is None or not imu.accelerometer_usable:
-        every = max(1, round(1.0 / period_s))  # each second
-        value[::every, Kind.LEVEL, :2] = 0.0
-        variance[::every, Kind.LEVEL, :2] = 0.7**2  # rad²
+        interval_ticks = max(1, round(1.0 / period_s))  # each second
+        value[::interval_ticks, Kind.LEVEL, :2] = 0.0
+        variance[::interval_ticks, Kind.LEVEL, :2] = 0.7**2  # rad²
     if imu is None or not stationary_ns.size:
         return
     inside = np.zeros(stamp_ns.size, np.bool_)
@@ -323,7 +327,7 @@ def _find_turn_rates(m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: 
     for role in roles:
         stamp_ns, values = get_turn_rates(m, role)
         inside = is_covered(stamp_ns, before_ns, after_ns)
-        if role == roles[0] != IMU:  # in its gaps nothing better is known
+        if role == roles[0] != IMU:  # also used in gaps of the other sources
             inside[:] = True
         rate[inside] = compute_interval_means(
             compute_seconds(stamp_ns, zero_ns), values, start_s[inside], end_s[inside]

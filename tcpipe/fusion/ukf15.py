@@ -3,10 +3,10 @@
 Ticks, models of motion and sensors, and their noise are those of the default estimator (`ticks`, `state`,
 `parameters`). filterpy does the scaled unscented transform (E. A. Wan and R. van der Merwe, 2000) of all errors at
 once: the fifteen of pose, body velocity and biases of the IMU, and the parameters that are not known exactly. Each
-state uses measurements up to its tick; nothing is smoothed, and contradictions between sensors are not explained. Noise
-and start are estimated from the whole section.
+state uses only measurements up to its tick: there is no smoothing and no search for changes. Noise and initial state
+are estimated from the whole section.
 
-The state of filterpy is the error of the estimate, zero between its steps: no angle needs a circle.
+The state of filterpy is the error of the estimate. It is zero between steps, so its angles need no wrapping.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from tcpipe.fusion.changes import Hypothesis
 from tcpipe.fusion.error_state import make_tests, make_trajectory, prepare_section
 from tcpipe.fusion.filter_kernel import RESET_REJECTIONS, RESET_SPEED_STD_MPS, FilterModel, GateVerdict, Memory
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S, InitialState, Measurements, Trajectory
-from tcpipe.fusion.smoother_kernel import SELDOM, Smoothed
+from tcpipe.fusion.smoother_kernel import STD_INTERVAL, Smoothed
 from tcpipe.fusion.state import Error, Kind
 from tcpipe.fusion.ticks import Pass, Ticks
 
-_MAX_ANGLE_STD_RAD = 1.0  # sigma points lie at √3 σ, and must not go round the circle
+_MAX_ANGLE_STD_RAD = 1.0  # sigma points are at √3 σ, and must not wrap around
 
 
 def run_ukf15(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_probability: float) -> Trajectory:
@@ -43,13 +43,13 @@ def run_ukf15(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_p
     initial = replace(initial, yaw_std_rad=min(initial.yaw_std_rad, _MAX_ANGLE_STD_RAD))
     forward, estimate = filter_forward(*section.prepare(section.make_start(initial)))
     found = make_trajectory(section, forward, estimate, output_ns, Hypothesis(()))
-    # While a forward filter learns a parameter its estimate changes, and the parameter does not.
+    # The estimate of a constant parameter still changes during a forward pass.
     parameters = {name: replace(learned, variation=()) for name, learned in found.facts.parameters.items()}
     return replace(found, facts=replace(found.facts, parameters=parameters))
 
 
 def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pass, Smoothed]:
-    """Return the forward pass over all ticks, and its estimate, without variances of displacements (NaN).
+    """Return the forward pass over all ticks, and its estimates, without variances of displacements (NaN).
 
     If the gate has rejected fixes or attitudes for as long as the default estimator allows, σ of pose and velocity is
     inflated, and the measurement is used.
@@ -57,7 +57,7 @@ def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pas
     size, period_s = ticks.stamp_ns.size, ticks.inputs.period_s
     ukf, tests = _Filter(ticks, model, start), make_tests(size)
     states, variances = np.zeros((size, state.NX)), np.zeros((size, 5))
-    spreads = np.zeros((-(-size // SELDOM), model.active.size))
+    stds = np.zeros((-(-size // STD_INTERVAL), model.active.size))
     rejected: dict[int, list[int]] = {kind: [] for kind in range(state.KINDS)}
     for k in range(size):
         if k > 0:
@@ -77,18 +77,18 @@ def filter_forward(ticks: Ticks, model: FilterModel, start: Memory) -> tuple[Pas
                 rejected[kind].clear()
             tests.nis[k, kind], tests.verdict[k, kind] = nis, verdict
         states[k], variances[k] = ukf.x, ukf.compute_variances()
-        if k % SELDOM == 0:
-            spreads[k // SELDOM] = np.sqrt(np.diag(ukf.covariance))
-    no_links = np.full((size, len(DISPLACEMENT_LAGS_S)), np.nan)
-    return Pass(ticks, model, [], tests, start), Smoothed(states, variances, no_links, spreads)
+        if k % STD_INTERVAL == 0:
+            stds[k // STD_INTERVAL] = np.sqrt(np.diag(ukf.covariance))
+    no_displacement_m2 = np.full((size, len(DISPLACEMENT_LAGS_S)), np.nan)
+    return Pass(ticks, model, [], tests, start), Smoothed(states, variances, no_displacement_m2, stds)
 
 
 class _Filter:
-    """The estimate ``x``, shape (51,), and filterpy's filter of its active errors, from tick to tick."""
+    """Estimate ``x``, shape (51,), and filterpy's filter of its active errors."""
 
     def __init__(self, ticks: Ticks, model: FilterModel, start: Memory) -> None:
         size = model.active.size
-        # The points lie at √3 σ whatever the number of errors, and match the fourth moment of a normal distribution.
+        # The points are at √3 σ for any number of errors, and match the fourth moment of a normal distribution.
         points = MerweScaledSigmaPoints(size, alpha=np.sqrt(3.0 / size), beta=2.0, kappa=0.0)
         self._ukf = UnscentedKalmanFilter(size, 1, ticks.inputs.period_s, None, None, points)
         self._ukf.P, self.x = _repair(start.P), start.x.copy()
@@ -101,10 +101,10 @@ class _Filter:
         return np.asarray(self._ukf.P)
 
     def predict(self, k: int) -> None:
-        """Carry the estimate over the motion of tick k, and the decay and walk of parameters."""
+        """Propagate the estimate over the motion of tick k, with decay and random walk of parameters."""
         inputs, model, before = self._inputs, self._model, self.x
-        kept, noise = model.kept.copy(), model.noise.copy()
-        kept[self._is_fix_error] = inputs.fix_kept[k]
+        decay, noise = model.kept.copy(), model.noise.copy()
+        decay[self._is_fix_error] = inputs.fix_kept[k]
         noise[self._is_fix_error] += inputs.fix_noise[k, model.active[self._is_fix_error] - Error.FIX_ERROR]
         # Rotation, position and velocity are always active, and first.
         noise[Error.THETA : Error.THETA + 3] += inputs.noise[k, :3]
@@ -120,19 +120,19 @@ class _Filter:
         def propagate(errors: Floats, _period_s: float) -> Floats:
             error = np.empty(state.MOVING)
             state.compute_moving_error(move(self._displace(before, errors)), self.x, error)
-            propagated = errors * kept
+            propagated = errors * decay
             propagated[moving] = error[model.active[moving]]
             return propagated
 
         self.x = move(before)
-        decays = kept != 1.0
-        self.x[model.active[decays] + 6] *= kept[decays]
+        decays = decay != 1.0
+        self.x[model.active[decays] + 6] *= decay[decays]
         self._ukf.Q = np.diag(noise)
         self._ukf.predict(fx=propagate)
         self._correct()
 
     def update(self, k: int, kind: int, gate: float) -> tuple[Floats, float]:
-        """Use one measurement of tick k unless it is beyond the gate; return its innovation and normalised square."""
+        """Apply one measurement of tick k unless the gate rejects it; return its innovation and NIS."""
         inputs, ukf, size, prior = self._inputs, self._ukf, state.SIZES[kind], self.covariance
         lever = inputs.attitude[k] if kind == Kind.ATTITUDE else inputs.levers[kind]
         acceleration = np.array([inputs.acceleration[k], 0.0, 0.0])
@@ -143,7 +143,7 @@ class _Filter:
             state.predict_measurement(kind, self._displace(self.x, errors), *circumstances, measured)
             return measured[:size]
 
-        ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)  # filterpy would use those before the last update
+        ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)  # filterpy would use the points before the last update
         ukf.update(inputs.value[k, kind, :size], np.diag(inputs.variance[k, kind, :size]), hx=measure)
         nis = float(ukf.y @ ukf.SI @ ukf.y)
         if not nis <= gate:
@@ -166,21 +166,21 @@ class _Filter:
         """Return the variance of position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], shape (5,)."""
         x, P, yaw = self.x, self.covariance, np.zeros(self._model.active.size)
         yaw[[1, 2]] = np.array([x[7], x[8]]) / max(x[0] ** 2 + x[3] ** 2, 1e-6)  # of atan2(R10, R00) by rotation errors
-        if self._model.mount >= 0:  # the robot turns with the IMU and with its mounting
+        if self._model.mount >= 0:  # the robot's rotation error: that of the IMU plus that of its mounting
             yaw[self._model.mount : self._model.mount + 3] = yaw[:3]
         R, to_position = x[:9].reshape(3, 3), slice(Error.RHO, Error.RHO + 3)
         position = np.einsum("ij,jk,ik->i", R, P[to_position, to_position], R)
         return np.array([*position, yaw @ P @ yaw, P[Error.U, Error.U]])
 
     def _displace(self, x: Floats, errors: Floats) -> Floats:
-        """Return the state that lies active errors, shape (n,), off a state."""
+        """Return a state displaced by active errors, shape (n,)."""
         every, displaced = np.zeros(state.N), np.empty(state.NX)
         every[self._model.active] = errors
         state.displace_state(x, every, 1.0, displaced, np.empty(9))
         return displaced
 
     def _correct(self) -> None:
-        """Add filterpy's error to the estimate, and rotate the axes of rotation and position errors with it."""
+        """Add filterpy's error to the estimate, and rotate the axes of rotation and position errors accordingly."""
         ukf, turn = self._ukf, np.eye(self._model.active.size)
         # The right Jacobian of SO(3) to second order (Solà 2017, eq. 183).
         for first, share in ((Error.THETA, -0.5), (Error.RHO, -1.0)):
@@ -192,7 +192,7 @@ class _Filter:
 
 
 def _repair(covariance: Floats) -> Floats:
-    """Return a covariance, symmetric; where rounding has made it useless, its variances alone."""
+    """Return a symmetric covariance; if rounding has made it invalid, only its variances."""
     symmetric = 0.5 * (covariance + covariance.T)
     try:
         np.linalg.cholesky(symmetric)

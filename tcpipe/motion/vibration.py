@@ -21,13 +21,11 @@ LEAST_RATE_HZ = 2.5 * HIGH_HZ
 _ORDER = 4
 _RATE_TOLERANCE = 0.98  # a 50 Hz IMU is 50 Hz though its stamps jitter
 _GAP_PERIODS = 3.0
-_RINGS_S = 1.0 / LOW_HZ
-"""Time around a gap that the filter spreads it over [s]."""
+_RINGS_S = 1.0 / LOW_HZ  # time around a gap that the filter spreads it over [s]
 _BATCH_S = 1.0
 """Length of a batch whose mean square is compared with that of the next but one [s]: longer than the correlation time
 of a resonance."""
-_MEDIAN_CHI2 = 0.4549
-"""Median of a chi-square distribution with one degree of freedom."""
+_MEDIAN_CHI2 = 0.4549  # median of a chi-square distribution with one degree of freedom
 _NS = 1e-9
 
 

@@ -18,19 +18,15 @@ from tcpipe.power.rails import Rail, interpolate_rail
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
 
-_WINDOW_S = 10.0
-"""Slower changes of the voltage are those of its charge."""
+_WINDOW_S = 10.0  # slower changes of the voltage are those of its charge
 _BLOCK_S = 10.0
-_FEWEST_BLOCKS = 6
-"""On either side of a change."""
+_FEWEST_BLOCKS = 6  # on either side of a change
 _FEWEST_SAMPLES = 400
 _CLEAR, _SURE, _GRADUAL = 20.0, 5.0, 3.0
 """Least [σ]: the resistance itself, its change, and proof that the change is not gradual (battery warms up)."""
 _FEWEST_BRAKED = 5
-_LIKELY = 8.0
-"""Logarithm of a ratio of likelihoods: of three thousand segments one by chance."""
-_SETTLED_NS = 300_000_000
-"""After a stop and before a start the motors still draw."""
+_LIKELY = 8.0  # logarithm of a ratio of likelihoods: of three thousand segments one by chance
+_SETTLED_NS = 300_000_000  # after a stop and before a start the motors still draw
 _SHORTEST_HALT_NS = 1_000_000_000
 
 

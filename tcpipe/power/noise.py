@@ -150,10 +150,8 @@ _PROCESSES = np.vstack((np.eye(6, 9), 2.0 * np.eye(3, 9, 3) - np.eye(3, 9, 6)))
 """Covariances of unit variance by exponentials: six are rough, three smooth, 2 exp(-d / tau) - exp(-2 d / tau)."""
 _SLOPES = np.append(np.zeros(6), 2.0 / _TAU[3:6] ** 2)
 """Slope variance of the smooth processes [1/s²]; h⁴ / 72 of it adds to an integral's error (Euler-Maclaurin)."""
-_SPACINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-"""Spacings of second differences, in samples: about two an octave."""
-_FEWEST = 20
-"""Fewest second differences at a spacing: their mean square is known to a third."""
+_SPACINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # spacings of second differences, in samples: about two an octave
+_FEWEST = 20  # fewest second differences at a spacing: their mean square is known to a third
 _LOCAL_NS, _PRIOR_SAMPLES, _MIN_SCALE = 2_000_000_000, 4.0, 0.05
 """Processes near a span: time before and after it [ns], weight of the whole record in samples, least value."""
 _CALM_S, _CALM_SAMPLES = 1.5, 8

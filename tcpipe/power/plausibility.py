@@ -12,8 +12,7 @@ from tcpipe.tables.findings import read_threshold
 
 EXCLUDED, REJECTED = "power-values-excluded", "power-rejected"
 _FEWEST_VALUES, _MARKS, _MOST_REPEATS = 20, 2, 5
-_SHORTEST_DRIVE_S = 1.0
-"""No robot starts and stops within this."""
+_SHORTEST_DRIVE_S = 1.0  # no robot starts and stops within this
 _JUMP, _ASYMMETRY, _FEWEST_JUMPS = 0.6, 0.02, 4
 """An overflow: smallest step and largest difference of both ends [fractions of the span], and fewest steps."""
 

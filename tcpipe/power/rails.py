@@ -24,8 +24,7 @@ import numpy as np
 from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.geometry.piecewise_linear import integrate_held_to, integrate_product_to, interpolate
 
-_PERIODS = 3
-"""Periods without a sample that are a gap, if the recipe allows less: single lost messages are no gap."""
+_PERIODS = 3  # periods without a sample that are a gap, if the recipe allows less: single lost messages are no gap
 
 
 @dataclass(frozen=True, slots=True)

@@ -206,8 +206,7 @@ def _read_charge(columns: Columns) -> Floats | None:
     return share * capacity_ah / (100.0 if np.nanmax(share) > 1.0 else 1.0)
 
 
-_MIN_CORRELATION = 0.7
-"""Smallest correlation at which a second meter measures the same power."""
+_MIN_CORRELATION = 0.7  # smallest correlation at which a second meter measures the same power
 
 
 def compare_second_meters(

@@ -23,17 +23,13 @@ from tcpipe.tables.facts import Smoothing
 from tcpipe.tables.findings import read_threshold
 
 _FEWEST_INTERVALS = 20
-_LEAST_MESSAGES = 1.5
-"""Fewest messages per reading."""
-_LONGEST_INTERVAL = 4
-"""In reading periods: longer ones, as of a stationary robot, show no period."""
+_LEAST_MESSAGES = 1.5  # fewest messages per reading
+_LONGEST_INTERVAL = 4  # in reading periods: longer ones, as of a stationary robot, show no period
 _REGULAR_SHARE = 0.9
-_SINGLE_SHARE = 0.5
-"""Smallest share of intervals that are one reading period long."""
+_SINGLE_SHARE = 0.5  # smallest share of intervals that are one reading period long
 _TOLERANCE = 0.3
 """Tolerance in reading periods: the next message shows a reading, and devices are not read at exact times."""
-_JUMPING_SHARE = 0.1
-"""Smallest share of changes by more than one level."""
+_JUMPING_SHARE = 0.1  # smallest share of changes by more than one level
 
 
 def find_readings(stamp_ns: Ints, values: Floats) -> Ints | None:
@@ -101,11 +97,9 @@ def _find_arrivals(at_ns: Floats, changed: Ints, *, period_ns: float, message_ns
 
 
 _FEWEST = 60
-_LATE = np.linspace(-1.0, 1.5, 26)
-"""Delays that are tried, in periods: 0 is a sample's, a half is a mean's."""
+_LATE = np.linspace(-1.0, 1.5, 26)  # delays that are tried, in periods: 0 is a sample's, a half is a mean's
 _NEAR = 0.25
-_CLEARLY = 0.9
-"""The better of two delays says so when its squared residuals are below this share of the other's."""
+_CLEARLY = 0.9  # the better of two delays says so when its squared residuals are below this share of the other's
 
 
 def is_stated_averaged(
@@ -137,18 +131,14 @@ def is_stated_averaged(
     return averaged < sampled
 
 
-_INSTANT_S = 0.1
-"""Span around a sample over which motion is averaged [s]."""
+_INSTANT_S = 0.1  # span around a sample over which motion is averaged [s]
 _WIDTHS_S = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
 _DELAYS_S = np.linspace(-2.0, 2.0, 81)
 SMOOTHING_MARGIN_S, DELAY_MARGIN_S = _WIDTHS_S[-1], 2.0 + _INSTANT_S
 """Motion that must be known before and after a power sample [s]."""
-_DELAY_GROUPS = 8
-"""Parts of the run, each of which is left out once."""
-_MAX_ROWS = 20_000
-"""Power samples that are compared with the motion, evenly taken of more."""
-_FEWEST_MEANS = 20
-"""Fewest means of a width in the record: five causes fit fewer by chance if power wanders slowly."""
+_DELAY_GROUPS = 8  # parts of the run, each of which is left out once
+_MAX_ROWS = 20_000  # power samples that are compared with the motion, evenly taken of more
+_FEWEST_MEANS = 20  # fewest means of a width in the record: five causes fit fewer by chance if power wanders slowly
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,8 +262,7 @@ def estimate_smoothing_variance(power: SampledSignal, steady: Mask, smoothing: S
     return share * float(np.mean(np.square(change[used]))) if used.any() else 0.0
 
 
-_USUAL_DELAY_S = 0.03
-"""σ of the delay of power where clocks are synchronised [s]: a period of 20 Hz or less."""
+_USUAL_DELAY_S = 0.03  # σ of the delay of power where clocks are synchronised [s]: a period of 20 Hz or less
 
 
 def estimate_delay_variance(

@@ -306,8 +306,7 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
 
 
 _FROZEN_NS, _FEWEST_EQUAL = 5_000_000_000, 20
-_MOVES = 0.5
-"""Share of the range of 90 % of a current: a current that changes by more is driven."""
+_MOVES = 0.5  # share of the range of 90 % of a current: a current that changes by more is driven
 _BESIDE, _CROWDED = 20, 10.0
 """Levels next to the end of a range, and least count at the end of a clipped current over that of such a level."""
 
@@ -455,8 +454,7 @@ def _check_current(current: Floats, median_amp: float, largest_amp: float) -> st
 
 
 LARGEST_VOLT, LARGEST_AMP = read_threshold(REJECTED, "max_median_volt"), read_threshold(REJECTED, "max_median_amp")
-_LARGEST_PER_VOLT = 100.0
-"""Times the largest current is the largest power [W]: 100 kW."""
+_LARGEST_PER_VOLT = 100.0  # times the largest current is the largest power [W]: 100 kW
 _SMALLEST_VOLT = read_threshold(REJECTED, "min_median_volt")
 _MIN_ROWS_TO_JUDGE = read_threshold(REJECTED, "max_equal_count")
 _UNAMBIGUOUS = read_threshold(REJECTED, "min_net_fraction")  # of the charge moved flows one way

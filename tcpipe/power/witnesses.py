@@ -24,17 +24,13 @@ from tcpipe.tables.findings import WITNESSES_OF_LABEL, Finding, Severity, Subjec
 IMPLAUSIBLE = "power-implausible"
 _GRAVITY_MPS2 = 9.80665
 
-_MIN_SEGMENTS = 20
-"""Fewest segments on which power is compared with slopes or weight."""
+_MIN_SEGMENTS = 20  # fewest segments on which power is compared with slopes or weight
 _INSTRUMENT_SHIFT = 2
 """Distance of the slope that serves as instrument [segments]: its height noise is independent, the hill is the same."""
-_BLOCK_SEGMENTS = 5
-"""Neighbouring segments have correlated residuals; σ is computed from blocks of this length."""
-_HUBER = 1.5
-"""Residuals beyond this many robust standard deviations get less weight."""
+_BLOCK_SEGMENTS = 5  # neighbouring segments have correlated residuals; σ is computed from blocks of this length
+_HUBER = 1.5  # residuals beyond this many robust standard deviations get less weight
 _ITERATIONS = 12
-_LEVEL_RISE = 0.05
-"""Largest tangent of the slope of level ground."""
+_LEVEL_RISE = 0.05  # largest tangent of the slope of level ground
 _MIN_CHARGE_FALL = 0.05
 """Smallest fall of a charge or state of charge that is compared, as a fraction: these counters have steps of 1 %."""
 _MIN_STRAIGHT_ROWS = 30
@@ -165,8 +161,7 @@ def compare_meters(drive_watt: Floats, pack_watt: Floats) -> tuple[float, float]
     return float(both / of_drive), float(both / np.sqrt(of_drive * of_pack))
 
 
-_MAX_HALF_SHARE = 0.36
-"""Half a side that is not measured leaves a share of a third."""
+_MAX_HALF_SHARE = 0.36  # half a side that is not measured leaves a share of a third
 
 
 def estimate_missing_std_fraction(side_share: float | None) -> float:

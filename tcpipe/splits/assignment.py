@@ -40,8 +40,7 @@ _NAMES = np.array([*SPLITS, EXCLUDED])
 _TRAIN, _TEST, _UNSEEN, _BUFFER, _EXCLUDED = np.arange(len(_NAMES), dtype=np.uint8)
 _CODE_BY_SIDE = np.array([_TRAIN, _UNSEEN, _BUFFER, _EXCLUDED])
 
-_CHUNK = 65_536
-"""Footprints whose centres are computed together."""
+_CHUNK = 65_536  # footprints whose centres are computed together
 
 
 @dataclass(frozen=True, slots=True)

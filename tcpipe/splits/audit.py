@@ -12,14 +12,11 @@ from tcpipe.tables.facts import HeldOut
 
 Ints = NDArray[np.signedinteger]
 
-_CONTACT_FRACTION = 1e-3
-"""Footprints that share less of their area than this touch; consecutive segments always do."""
+_CONTACT_FRACTION = 1e-3  # footprints that share less of their area than this touch; consecutive segments always do
 
-_CHUNK = 4_096
-"""Footprints looked at together: each may be near hundreds of others."""
+_CHUNK = 4_096  # footprints looked at together: each may be near hundreds of others
 
-_PAIRS = 65_536
-"""Pairs that are geometries at one time (1 kB each)."""
+_PAIRS = 65_536  # pairs that are geometries at one time (1 kB each)
 
 CLOSE = 1.05
 """Ground nearer than so many chords to a training sample counts as covered: consecutive samples are one chord apart."""

@@ -22,11 +22,9 @@ Geometries = TypeVar("Geometries", BaseGeometry, NDArray[np.object_])
 _EDGE_STEP_DEG = 0.001
 """Edges are straight in lon/lat; at this step (100 m) the projected edge is straight to 1 mm below 70° latitude."""
 
-_CHUNK = 65_536
-"""Footprints that are geometries at one time (0.5 kB each)."""
+_CHUNK = 65_536  # footprints that are geometries at one time (0.5 kB each)
 
-_PIECE_EDGES = 16
-"""Edges of a piece of a border."""
+_PIECE_EDGES = 16  # edges of a piece of a border
 
 
 class Side(IntEnum):

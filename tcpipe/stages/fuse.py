@@ -1,7 +1,7 @@
-"""Fuse: streams become one track of base_link, 20 times a second, with its uncertainty (L1 to L2).
+"""Fuse streams into one track of base_link at 20 Hz with its uncertainty (L1 to L2).
 
-Time offsets between the clocks of sensors are taken out before fusion. Power is not fused, and its stamps stay as they
-are.
+Time offsets between the clocks of sensors are corrected before fusion. Power is not fused, and its stamps do not
+change.
 """
 
 from __future__ import annotations
@@ -35,30 +35,31 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     """Return the track of a run; rows are in order of clock epoch and stamp.
 
     Each clock epoch, and each part of it between long pauses, is fused separately. Stamps are multiples of the track's
-    period; where no sensor measures motion for ``max_gap_s`` there are no rows, so a gap is a step in the stamps.
+    period. If no sensor measures motion for ``max_gap_s``, the track has no rows there: a gap is a step in the stamps.
 
-    Raises `FusionError`: no sensor measures motion, or the estimate breaks down in every section.
+    Raises `FusionError`: no sensor measures motion, or the estimate diverges in every section.
     """
-    fixes = find_fixes_role(streams)
+    fixes_role = find_fixes_role(streams)
     try:
-        return _fuse(streams, config, run_id, fixes)
+        return _fuse(streams, config, run_id, fixes_role)
     except FusionError as error:
-        raise FusionError(*error.problems, findings=rename_role(error.findings, GNSS, fixes)) from error
+        raise FusionError(*error.problems, findings=rename_role(error.findings, GNSS, fixes_role)) from error
 
 
-def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Track:
+def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes_role: str) -> Track:
+    """Fuse the streams of a run; ``fixes_role`` is the role of its positions, GNSS or pose."""
     run, read = Subject("run", run_id), streams.report
-    # 1. Streams become sections of measurements: one frame, one set of units, usable variances, without sensors that
-    # cannot be right.
+    # 1. Convert streams to sections of measurements with common frame and units and usable variances, and exclude
+    # implausible sensors.
     streams, is_local = use_pose_as_fixes(streams)
     sections = exclude_other_clocks(prepare_sections(streams, config), streams)
     sections = find_clocks(drop_implausible_sensors(sections, streams))
-    # 2. Initial state, filter and smoother of each section.
+    # 2. Find the initial state of each section; filter and smooth it.
     sections, fused, errors = fuse_sections(sections, streams, config)
     failures = merge_findings(finding for error in errors for finding in error.findings)
     if not fused.found:
         problems = [problem for error in errors for problem in error.problems] or ["no motion to fuse"]
-        nothing = [] if errors else [_find_nothing(streams, sections, run)]
+        nothing = [] if errors else [_explain_missing_track(streams, sections, run)]
         raise FusionError(*problems, findings=(*failures, *nothing, *find_exclusions(sections)))
     columns = {name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]}
     is_local |= bool(np.isnan(columns["lon_deg"]).all())
@@ -67,7 +68,7 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
     table = TRACK.table(**columns)
     origin = next((section.datum_deg_m for section in sections if section.datum_deg_m), None)
     datum = None if is_local or origin is None else Datum(*origin, crs=streams.gnss_crs)
-    # 3. Excluded sensors, and what the run shows of the others.
+    # 3. List excluded sensors, and findings on the other sensors.
     summary = make_fuse_facts(sections, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
     exclusions = find_exclusions(sections)
     is_antenna_alone = any(section.measurements.is_antenna_alone for section in sections)
@@ -85,19 +86,20 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str, fixes: str) -> Trac
         "sensor_checks": SensorChecks({finding.subject.name: finding.code for finding in reversed(exclusions)}),
         "clock_offsets": tuple(section.clocks for section in sections),
     }
-    findings, facts = rename_role((findings, facts), GNSS, fixes)
-    report = StageReport((*_drop_places(read.findings, findings), *findings), replace(read.facts, **facts))
+    findings, facts = rename_role((findings, facts), GNSS, fixes_role)
+    report = StageReport((*_update_read_findings(read.findings, findings), *findings), replace(read.facts, **facts))
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
-    return Track(table, make_rejections_table(sections, fused.found, fixes), info)
+    return Track(table, make_rejections_table(sections, fused.found, fixes_role), info)
 
 
 def fuse_sections(
     sections: Sequence[Section], streams: Streams, config: FuseConfig
 ) -> tuple[list[Section], Fused, list[FusionError]]:
-    """Return the sections on one clock each, their track, and why some have none.
+    """Return the sections after correction of clocks, their track, and the errors of sections without track.
 
-    A section is fused again without the offset of a clock that its estimate finds to step. A local frame goes on from
-    the end of the section before. Where one section has a place on the earth, those without fixes are skipped.
+    A section is fused again if its estimate finds that a corrected clock steps; the correction is then left out. A
+    local frame continues from the end of the section before. If one section has positions on the earth, sections
+    without fixes are skipped.
     """
     given, used, tracks, errors = [*sections], correct_clocks(sections, streams), list[Fused](), list[FusionError]()
     for place, section in enumerate(used):
@@ -125,8 +127,8 @@ def _skip(section: Section) -> Fused:
     return Fused(skipped_s=float(np.diff(section.span_ns)[0]) * 1e-9)
 
 
-def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
-    """Yield the findings of reading; missing extrinsics lose their remedy if estimated, and vanish if unused."""
+def _update_read_findings(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
+    """Yield the findings of reading; missing extrinsics lose their remedy if estimated, and are left out if unused."""
     estimated = {
         role for finding in fused for remedy in finding.remedies for role in remedy.recipe.get("read.extrinsics", ())
     }
@@ -137,7 +139,7 @@ def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Itera
             yield replace(finding, remedies=()) if role in estimated else finding
 
 
-def _find_nothing(streams: Streams, sections: Sequence[Section], run: Subject) -> Finding:
+def _explain_missing_track(streams: Streams, sections: Sequence[Section], run: Subject) -> Finding:
     rows: dict[str, Any] = {f"{role}_row_count": table.num_rows for role, table in streams.tables.items()}
     counts = add_counts(sections)
     rows |= {f"{role}_unusable_count": count["invalid"] for role, count in counts.items() if count["invalid"]}

@@ -1,4 +1,4 @@
-"""Clocks of the sensors by section: a far one excludes its sensor; small offsets and drifts are removed."""
+"""Clocks of the sensors by section: large offsets exclude a sensor; small offsets and drifts are corrected."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from tcpipe.tables.levels import Streams
 
 
 def exclude_other_clocks(sections: Sequence[Section], streams: Streams) -> list[Section]:
-    """Return the sections without sensors whose clocks are more than a second off in it or in the longest one.
+    """Return the sections without sensors whose clocks differ by more than a second, here or in the longest section.
 
-    No label of the run is usable until the recipe states the offset, since it is unknown which of the clocks power has.
+    No label of the run is usable until the recipe states the offset, since it is unknown which clock stamps power.
     """
     found, known = [*sections], dict[str, tuple[str, ClockOffset]]()
     for place in rank_sections(sections):
@@ -50,7 +50,7 @@ def exclude_other_clocks(sections: Sequence[Section], streams: Streams) -> list[
 
 
 def find_late_sensors(streams: Streams, config: FuseConfig) -> dict[str, float]:
-    """Return the delay of sensors' stamps against those of most sensors [s], by role, without unknown ones."""
+    """Return, by role, the delay of each sensor's stamps relative to most sensors [s]; unknown delays are missing."""
     sections = prepare_sections(use_pose_as_fixes(streams)[0], config)
     if not sections:
         return {}
@@ -61,9 +61,9 @@ def find_late_sensors(streams: Streams, config: FuseConfig) -> dict[str, float]:
 def find_clocks(sections: Sequence[Section]) -> list[Section]:
     """Return the sections with the time offsets between their sensors.
 
-    A section decides about its own clocks. A sensor whose clock it cannot compare has the constant offset that a
-    section with a longer drive shows: latency is a constant of the driver. If the clock drifts there, its offset here
-    is unknown, and is doubted.
+    Each section determines its own clocks. If it cannot compare the clock of a sensor, it takes the constant offset
+    from the section with the longest drive: latency is a constant of the driver. If the clock drifts there, the offset
+    is unknown.
     """
     found = [*sections]
     shown: dict[str, tuple[ClockOffset, str, int]] = {}
@@ -84,7 +84,7 @@ def find_clocks(sections: Sequence[Section]) -> list[Section]:
 
 
 def correct_clocks(sections: Sequence[Section], streams: Streams) -> list[Section]:
-    """Return the sections with one clock each: each clock's offset and drift about the section's middle are removed."""
+    """Return the sections with corrected stamps: without clock offsets and drifts (about the section's middle)."""
     corrected, stated_s = [], streams.report.facts.time_offset_s.get(GNSS, 0.0)
     for section in sections:
         middle_ns = sum(section.span_ns) // 2
@@ -98,7 +98,7 @@ def correct_clocks(sections: Sequence[Section], streams: Streams) -> list[Sectio
 
 
 def find_offsets(sections: Sequence[Section], streams: Streams) -> list[Finding]:
-    """Return the findings on clocks; those of several sections name the time of theirs."""
+    """Return the findings on clocks; with several sections, each finding has the time span of its section."""
     findings = []
     for section in (sections[place] for place in rank_sections(sections)):
         span_s = find_span_s(*section.span_ns, streams)
@@ -109,7 +109,7 @@ def find_offsets(sections: Sequence[Section], streams: Streams) -> list[Finding]
 
 
 def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Streams, span_s: float) -> Finding:
-    """Return the finding on a clock: which is off where two others agree, else that two differ."""
+    """Return the finding on a clock: that it is wrong if two others agree, else that two clocks differ."""
     compared = dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against})
     names, drift_s = {"reference": found.reference, "by": ", ".join(compared)}, 1e-6 * offset.drift_ppm * span_s
     numbers: dict[str, Any] = {"offset_s": offset.offset_s, "offset_2std_s": 2 * offset.std_s}
@@ -124,7 +124,7 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
 
 
 def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Remedy, ...]:
-    """Return what corrects the stamps of a sensor; a receiver's own velocity has the clock of its fixes."""
+    """Return the recipe lines that correct the stamps of a sensor; a receiver's velocity has the clock of its fixes."""
     given_s = streams.report.facts.time_offset_s.get(role, 0.0)
     correction_s = round(given_s - offset.offset_s, 3)
     roles = (role, DOPPLER) if role == GNSS and DOPPLER in streams.tables else (role,)
@@ -132,10 +132,10 @@ def _state_offset(role: str, offset: ClockOffset, streams: Streams) -> tuple[Rem
 
 
 def find_clock_jumps(sections: Sequence[Section]) -> Iterator[tuple[int, Finding]]:
-    """Yield the first stamps [ns] after the clock of all sensors was set forward, and the findings.
+    """Yield the first stamp [ns] after each forward step of the clock of all sensors, and its finding.
 
-    Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive
-    meanwhile.
+    A forward step has no measurements before it, and the robot, which drives before and after, does not move meanwhile
+    according to the fixes.
     """
     stamps = [sensor.stamp_ns for section in sections for sensor in section.measurements.sensors().values()]
     for epoch in dict.fromkeys(section.clock_epoch for section in sections):

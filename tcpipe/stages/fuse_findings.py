@@ -1,4 +1,4 @@
-"""Facts and findings of fusing: rejections, contradictions, and corrected lever arms, extrinsics and scales."""
+"""Facts and findings of fusion: rejections, contradictions, and corrected lever arms, extrinsics and scales."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tcpipe.tables.levels import Sensor, Streams
 def make_fuse_facts(
     inputs: Sequence[Section], sections: Sequence[StretchFacts], *, rows: int, skipped_s: float
 ) -> FuseFacts:
-    """Return the facts of the run: counts by role over all sections, what was set aside, and each section."""
+    """Return the facts of the run: counts by role over all sections, excluded measurements, and each section."""
     roles = sorted({role for section in sections for role in section.measurements})
     nis: dict[str, float | None] = {}
     for role in roles:
@@ -51,7 +51,7 @@ def make_fuse_facts(
 
 
 def add_counts(inputs: Sequence[Section]) -> dict[str, dict[str, int]]:
-    """Return by role the counts of messages that are not used as they are."""
+    """Return, by role, the counts of messages that are excluded or changed."""
     total: dict[str, dict[str, int]] = {}
     for role, each in (item for section in inputs for item in section.prepared.items()):
         counts = {
@@ -64,12 +64,12 @@ def add_counts(inputs: Sequence[Section]) -> dict[str, dict[str, int]]:
 
 
 def find_fuse_findings(inputs: Sequence[Section], facts: FuseFacts, *, run: Subject) -> tuple[Finding, ...]:
-    """Return what was observed while fusing."""
+    """Return the findings of fusion."""
     first_ns = min((section.start_ns for section in facts.stretches), default=0)
     unused = set.intersection(*(set(section.excluded) for section in inputs))
     every = (finding for section in inputs for finding in section.findings)
     findings = [*dict.fromkeys(finding for finding in every if finding.subject.name not in unused)]
-    # A log without any fix was found when it was read.
+    # Reading already reports a log without fixes.
     if GNSS in facts.set_aside and all(section.datum_deg_m is None for section in inputs):
         findings.append(make_finding("local-frame", Subject("role", GNSS)))
     findings += _find_gate_resets(facts, first_ns)
@@ -87,7 +87,7 @@ def find_fuse_findings(inputs: Sequence[Section], facts: FuseFacts, *, run: Subj
 
 
 def _find_gate_resets(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
-    """Yield how often fixes contradicted the odometry for seconds, and where most."""
+    """Yield the finding that fixes contradicted the odometry for seconds: number of times, and the largest one."""
     gate_resets = [gate_reset for section in facts.stretches for gate_reset in section.gate_resets]
     odometries = [role for role in (WHEELS, VISUAL) if role in facts.sensors]
     if gate_resets:
@@ -98,7 +98,7 @@ def _find_gate_resets(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
 
 
 def _find_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Finding]:
-    """Yield the explanations of contradictions, their times and sizes; and the sections that need many changes."""
+    """Yield a finding for each change that explains a contradiction, and for each section with many changes."""
     changes = (each for section in facts.stretches for each in section.changes if each.kind in CHANGES)
     for change in sorted(changes, key=lambda each: each.start_ns):
         names, span_s = {"change": CHANGES[change.kind].format(change.size)}, _find_span_s(change, first_ns)
@@ -110,7 +110,7 @@ def _find_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Fin
 
 
 def _find_weak_sensors(facts: FuseFacts) -> Iterator[Finding]:
-    """Yield the odometry whose scale nothing shows well, and the sensors of which many measurements are rejected."""
+    """Yield findings on odometries with an uncertain scale, and on sensors with many rejected measurements."""
     std = max((section.common_scale_std or 0.0 for section in facts.stretches), default=0.0)
     if std > read_threshold("odometry-scale-unobservable", "min_scale_std_fraction"):
         role = WHEELS if WHEELS in facts.sensors or VISUAL not in facts.sensors else VISUAL
@@ -119,7 +119,9 @@ def _find_weak_sensors(facts: FuseFacts) -> Iterator[Finding]:
     for role, count in facts.measurements.items():
         rejected = facts.rejected[role]
         if rejected > read_threshold("measurements-rejected", "max_rejected_fraction") * count:
-            is_alone = {GNSS, WHEELS, VISUAL}.intersection(facts.sensors) <= {role}  # without any there is no track
+            is_alone = {GNSS, WHEELS, VISUAL}.intersection(facts.sensors) <= {
+                role
+            }  # without any of them there is no track
             yield make_finding(
                 "measurements-rejected",
                 Subject("role", role),
@@ -143,16 +145,19 @@ CHANGES = {
     "frame": "the frame of its attitude turned by {:.2f} rad",
     "pose": "its clock stepped, or the robot was moved by {:.1f} m without being measured",
 }
-"""Changes in words, with their size."""
+"""Sentences for changes, with their size."""
 
 
 def _find_span_s(each: StretchFacts | GateReset | ChangeFacts, first_ns: int) -> tuple[float, float]:
-    """Return begin and end since the first stamp [s]; the first tick is before it."""
+    """Return start and end since the first stamp [s]; the first tick may be before that stamp."""
     return max(each.start_ns - first_ns, 0) / 1e9, (each.end_ns - first_ns) / 1e9
 
 
 def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams: Streams) -> Iterator[Finding]:
-    """Yield extrinsics and scales of the longest section that differ from the stated ones, with the recipe keys."""
+    """Yield findings on extrinsics and scales that differ from the stated ones, with recipe keys.
+
+    The longest section determines them.
+    """
     longest = facts.longest
     parameters = longest.parameters
     arm, tilt = parameters.get("antenna"), parameters.get("mounting of the IMU")
@@ -160,15 +165,15 @@ def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams
         sensor, turned = streams.sensors[GNSS], parameters.get("mounting of the pose")
         turn = _find_rotation(turned, inputs, longest, sensor)
         if sensor.placed_by == "assumed" or _is_contradicted(arm, 0.1):
-            yield _find_arm(arm, sensor, turn)
-        off = quat_from_matrix(turn @ matrix_from_quat(sensor.quat_xyzw).T)
-        off_rad = float(np.linalg.norm(rotation_vector_from_quat(off)))
-        unsure_rad = 0.0 if turned is None else float(np.linalg.norm(turned.std))
-        if sensor.placed_by != "assumed" and off_rad > max(MIN_SIGMAS * unsure_rad, 0.05):
+            yield _make_arm_finding(arm, sensor, turn)
+        difference_xyzw = quat_from_matrix(turn @ matrix_from_quat(sensor.quat_xyzw).T)
+        angle_rad = float(np.linalg.norm(rotation_vector_from_quat(difference_xyzw)))
+        angle_std_rad = 0.0 if turned is None else float(np.linalg.norm(turned.std))
+        if sensor.placed_by != "assumed" and angle_rad > max(MIN_SIGMAS * angle_std_rad, 0.05):
             remedies, names = state_extrinsics(GNSS, sensor.xyz_m, turn), {"placed_by": sensor.placed_by}
-            yield make_finding("pose-rotated", Subject("role", GNSS), names=names, remedies=remedies, off_rad=off_rad)
+            yield make_finding("pose-rotated", Subject("role", GNSS), names=names, remedies=remedies, off_rad=angle_rad)
     if tilt is not None and _is_contradicted(tilt, np.radians(1.0)):
-        yield _find_tilt(tilt, streams.sensors[IMU])
+        yield _make_tilt_finding(tilt, streams.sensors[IMU])
     for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):
         found = parameters.get(name)
         if found is not None and _is_contradicted(found, 0.1):
@@ -176,7 +181,7 @@ def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams
             stated = (streams.report.facts.odometry_scale or {}).get(role, 1.0)
             remedies = suggest("state", {"read.odometry_scale": {role: round(stated / scale, 4)}})
             yield make_finding("odometry-scale", Subject("role", role), remedies=remedies, scale=scale, scale_std=std)
-    # That of wheels always varies: they slip.
+    # The scale of wheels always varies, since they slip.
     camera = parameters.get("camera scale")
     varies = {} if camera is None else {VISUAL: max(camera.variation, default=0.0)}
     varies |= {each.role: each.size for section in facts.stretches for each in section.changes if each.kind == "varies"}
@@ -186,14 +191,14 @@ def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams
 
 
 def _is_contradicted(found: ParameterFacts, least: float) -> bool:
-    """Return whether a parameter surely differs from what is stated, by ``least`` [m], [rad] or [1] at least."""
+    """Return whether a parameter differs significantly from the stated value, and by at least ``least``."""
     return any(abs(v) > max(MIN_SIGMAS * s, least) for v, s in zip(found.value, found.std, strict=True))
 
 
 def _find_rotation(
     turned: ParameterFacts | None, inputs: Sequence[Section], part: StretchFacts, sensor: Sensor
 ) -> Floats:
-    """Return how the sensor of positions is turned on the robot, shape (3, 3): that of a pose as its run shows it."""
+    """Return the rotation of the positions' sensor to base_link, (3, 3); for a pose as estimated from its run."""
     of_epoch = (each.measurements.gnss for each in inputs if each.clock_epoch == part.clock_epoch)
     fixes = next((each for each in of_epoch if each is not None and each.stamp_ns[-1] >= part.start_ns), None)
     if turned is None or fixes is None:
@@ -201,7 +206,7 @@ def _find_rotation(
     return matrix_from_quat(multiply(quat_from_rotation_vector(turned.value), fixes.mounting_xyzw))
 
 
-def _find_arm(arm: ParameterFacts, sensor: Sensor, turn: Floats) -> Finding:
+def _make_arm_finding(arm: ParameterFacts, sensor: Sensor, turn: Floats) -> Finding:
     place = np.asarray(sensor.xyz_m) + arm.value
     axes = ("forward", "left", "up")
     numbers: dict[str, Any] = {f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)}
@@ -215,8 +220,8 @@ def _find_arm(arm: ParameterFacts, sensor: Sensor, turn: Floats) -> Finding:
     )
 
 
-def _find_tilt(tilt: ParameterFacts, sensor: Sensor) -> Finding:
-    """Return the finding of a rotated IMU: the inverse rotation turns its measurements into robot axes."""
+def _make_tilt_finding(tilt: ParameterFacts, sensor: Sensor) -> Finding:
+    """Return the finding of a rotated IMU: the inverse rotation gives its measurements in robot axes."""
     turn = matrix_from_quat(quat_from_rpy(*(-value for value in tilt.value))) @ matrix_from_quat(sensor.quat_xyzw)
     return make_finding(
         "imu-tilted",
@@ -232,7 +237,7 @@ _Named = TypeVar("_Named")
 
 
 def rename_role(value: _Named, old: str, new: str) -> _Named:
-    """Return findings or facts in which one role stands for another."""
+    """Return findings or facts with one role replaced by another."""
     named = cast("object", value)
     if isinstance(value, str):
         named = new if value == old else value

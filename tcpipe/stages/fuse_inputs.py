@@ -1,4 +1,4 @@
-"""Sections of a run: measurements by clock epoch, without sensors that contradict physics or the other sensors."""
+"""Sections of a run: measurements by clock epoch, without sensors that contradict physics or other sensors."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ from tcpipe.tables.levels import Sensor, Streams
 class Section:
     """A clock epoch of a run, or a part of it without a pause of an hour, and all decisions on its sensors.
 
-    Units and mounting are constants of the robot: a section also has those that sections with a longer drive show.
-    Everything else is decided in each section alone.
+    Units and mounting are constants of the robot, so a section also takes those found in sections with a longer drive.
+    All other decisions are made for each section separately.
 
     Attributes
     ----------
-    command : last command of its clock epoch; None without commands.
+    command : commands of its clock epoch; None without commands.
     datum_deg_m : longitude, latitude, height of the local frame's origin; None without fixes.
-    prepared : by role, messages that are not used as they are.
-    excluded : by role, why a sensor is not fused.
+    prepared : by role, messages that are excluded or changed.
+    excluded : by role, reason for the exclusion of a sensor.
     clocks : time offsets of the sensors; ``measurements`` contain them until
     `tcpipe.stages.fuse_clocks.correct_clocks`.
-    cuts : by first stamp [ns] after the clock of all sensors was set forward, the finding.
+    cuts : findings of forward steps of the clock of all sensors, by the first stamp after the step [ns].
     """
 
     clock_epoch: int
@@ -73,13 +73,13 @@ class Section:
 
     @property
     def offsets(self) -> dict[str, ClockOffset]:
-        """By role, the time offsets that are corrected."""
+        """Time offsets that are corrected, by role."""
         sensors = self.measurements.sensors()
         return {role: offset for role, offset in self.clocks.offsets.items() if offset.noted and role in sensors}
 
     @property
     def driven_m(self) -> float:
-        """Distance that the first sensor of motion measures [m]: how much the section shows of its sensors."""
+        """Distance by the first motion sensor [m]: a longer drive determines more about the sensors."""
         return float(np.diff(compute_driven_m(self.measurements, np.array(self.span_ns)))[0])
 
 
@@ -89,7 +89,7 @@ def rank_sections(sections: Sequence[Section]) -> list[int]:
 
 
 def prepare_sections(streams: Streams, config: FuseConfig) -> list[Section]:
-    """Return the measurements of each clock epoch, in order of epoch and time, if they have a usable value."""
+    """Return the measurements of each clock epoch with at least one usable value, in order of epoch and time."""
     tables = {role: streams.tables[role] for role in (GNSS, DOPPLER, IMU, WHEELS, VISUAL) if role in streams.tables}
     tables |= {GNSS: streams.tables[POSE]} if POSE in streams.tables else {}
     datum = None
@@ -110,7 +110,7 @@ def prepare_sections(streams: Streams, config: FuseConfig) -> list[Section]:
 
 
 def _split_at_pauses(parts: Mapping[str, pa.Table]) -> Iterator[dict[str, pa.Table]]:
-    """Yield parts of tables between pauses of an hour: a log may begin in 1970, and grids over an hour are small."""
+    """Yield the parts of tables between pauses of an hour; some logs begin in 1970, and grids must stay small."""
     stamps = {role: to_integers(part, "stamp_ns") for role, part in parts.items()}
     every = np.unique(np.concatenate([*stamps.values()]))
     first = np.concatenate((every[:1], every[1:][np.diff(every) > 3_600_000_000_000], every[-1:] + 1))
@@ -122,6 +122,7 @@ def _split_at_pauses(parts: Mapping[str, pa.Table]) -> Iterator[dict[str, pa.Tab
 def _prepare_section(
     tables: Mapping[str, pa.Table], streams: Streams, config: FuseConfig, datum: tuple[float, float, float] | None
 ) -> Section:
+    """Return the measurements and findings of a clock epoch, or of a part of it."""
     every = {role: _prepare(role, part, streams.sensors[role], config, datum) for role, part in tables.items()}
     prepared: dict[str, Prepared] = {role: each for role, (_, each) in every.items()}
     found = {role: sensor for role, (sensor, _) in every.items() if sensor is not None and sensor.stamp_ns.size}
@@ -137,10 +138,10 @@ def _prepare_section(
             findings.append(make_finding("frozen", fixes, span_s=span_s, names=frozen, message_count=count))
     if gnss is not None and odometry is not None:
         gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
-        if (jumpy := jitter_s > 0).any():
-            share, median_s = float(jumpy.mean()), float(np.median(jitter_s[jumpy]))
+        if (has_jitter := jitter_s > 0).any():
+            share, median_s = float(has_jitter.mean()), float(np.median(jitter_s[has_jitter]))
             finding = make_finding("stamp-jitter", fixes, jitter_fraction=share, jitter_s=median_s)
-            # Where most fixes jitter, most places are doubted.
+            # If most stamps jitter, most positions are uncertain.
             findings.append(replace(finding, severity="warning") if share > 0.5 else finding)
     return Section(
         0,
@@ -161,6 +162,7 @@ def find_span_s(start_ns: int, end_ns: int, streams: Streams) -> tuple[float, fl
 def _prepare(
     role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, datum_deg_m: tuple[float, float, float] | None
 ) -> tuple[Any, Prepared]:
+    """Return a sensor's measurements (None without any), and the counts and findings of their preparation."""
     stamp_ns, columns = to_integers(table, "stamp_ns"), read_float_columns(table)
     place: Mapping[str, Any] = {"xyz_m": sensor.xyz_m, "quat_xyzw": sensor.quat_xyzw}
     if role == GNSS:
@@ -195,11 +197,10 @@ def _prepare(
 
 
 def drop_implausible_sensors(sections: Sequence[Section], streams: Streams) -> list[Section]:
-    """Return the sections without the sensors that cannot be right.
+    """Return the sections without implausible sensors.
 
-    Sections are judged from the longest drive to the shortest. Each one decides about its own sensors, after it has
-    taken over the constants of the robot that those before it have shown: a few metres do not show the sign of a yaw
-    rate.
+    Sections are checked from the longest drive to the shortest. Each section checks its own sensors, but takes units
+    and mounting from the sections before: a few metres do not determine the sign of a yaw rate.
     """
     stated = ("recipe", "tf_static", "same frame")
     is_imu_stated = IMU in streams.sensors and streams.sensors[IMU].placed_by in stated
@@ -223,9 +224,9 @@ def drop_implausible_sensors(sections: Sequence[Section], streams: Streams) -> l
 
 
 def exclude_sensors(section: Section, exclusions: Iterable[SensorExclusion], streams: Streams) -> Section:
-    """Return a section without some sensors."""
+    """Return a section without the given sensors, with their findings."""
     excluded = {**section.excluded, **{each.role: _find_exclusion(each, section, streams) for each in exclusions}}
-    # The receiver's velocity is of the antenna of the fixes.
+    # The receiver's velocity needs the antenna position of the fixes.
     gone = dict.fromkeys((*excluded, DOPPLER) if GNSS in excluded else excluded)
     return replace(
         section,
@@ -236,7 +237,7 @@ def exclude_sensors(section: Section, exclusions: Iterable[SensorExclusion], str
 
 
 def _define_base_by_antenna(section: Section, streams: Streams) -> Section:
-    """Return a section with an antenna of unknown place near base_link, if no other sensor of motion is fused."""
+    """Return a section with base_link near the antenna, if its lever arm is unknown and it is fused alone."""
     m = section.measurements
     if m.gnss is None or not m.is_antenna_alone or streams.sensors[GNSS].placed_by != "assumed":
         return section
@@ -246,7 +247,7 @@ def _define_base_by_antenna(section: Section, streams: Streams) -> Section:
 
 
 def _find_exclusion(exclusion: SensorExclusion, section: Section, streams: Streams) -> Finding:
-    """Return the finding of a sensor that is not fused; no label needs the velocity of a fused receiver."""
+    """Return the finding of a sensor that is not fused; without a receiver's velocity all labels remain usable."""
     sensor, name = streams.sensors[exclusion.role], exclusion.role
     if exclusion.units is not None:
         remedies = suggest("state_units", {"read": {"imu_units": exclusion.units}})
@@ -271,12 +272,12 @@ def _find_exclusion(exclusion: SensorExclusion, section: Section, streams: Strea
 
 
 def exclude_role(name: str) -> tuple[Remedy, ...]:
-    """Return what excludes a role, whichever topic is used as it and whoever chose that."""
+    """Return the remedy that excludes a role, for any topic and any source of the choice."""
     return suggest("exclude", {"read.topics": {name: []}})
 
 
 def state_extrinsics(name: str, xyz_m: Sequence[float], turn: Floats) -> tuple[Remedy, ...]:
-    """Return what states a sensor's lever arm [m] and its rotation to base_link, shape (3, 3)."""
+    """Return the remedy that states a sensor's lever arm [m] and its rotation to base_link, shape (3, 3)."""
     place, rpy_rad = (np.round(values, digits) + 0.0 for values, digits in ((xyz_m, 3), (rpy_from_matrix(turn), 4)))
     return suggest(
         "state_extrinsics", {"read.extrinsics": {name: {"xyz_m": place.tolist(), "rpy_rad": rpy_rad.tolist()}}}

@@ -1,4 +1,4 @@
-"""Each section of a run from its start to its track: start, filter and smoother, and further columns."""
+"""Fuse each section of a run: initial state, filter and smoother, and further columns of the track."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tcpipe.tables.levels import REJECTIONS, Streams
 
 @dataclass(slots=True)
 class Fused:
-    """Trajectory, facts and columns of every section; time without track [s]."""
+    """Trajectories, facts and columns of all sections; time without track [s]."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
@@ -60,15 +60,15 @@ def fuse_section(section: Section, streams: Streams, config: FuseConfig, last: T
         if output_ns.size == 0 or (section.datum_deg_m is not None and m.gnss is None):
             fused.skipped_s += (part.end_ns - part.start_ns) * 1e-9
             continue
-        # 1. Its initial state.
+        # 1. Find the initial state.
         initial = find_initial_state(m, find_stationary_intervals(m), part.start_ns)
         if last is not None and section.datum_deg_m is None:
             initial = replace(initial, position_enu_m=last.position_enu_m[-1], quat_xyzw=last.quat_xyzw[-1])
-        # 2. Filter and smoother.
+        # 2. Filter and smooth.
         trajectory = _estimate(part, initial, output_ns, config)
         fused.found.append(trajectory)
         fused.facts.append(make_section_facts(part, initial, trajectory))
-        # 3. Other quantities at the track's stamps.
+        # 3. Compute other quantities at the track's stamps.
         fused.columns.append(_make_columns(part, trajectory, section, streams, config))
         last = trajectory
     return fused
@@ -100,7 +100,7 @@ Arrays = dict[str, Floats]
 
 
 def make_pose_columns(found: Trajectory, datum_deg_m: tuple[float, float, float] | None) -> Arrays:
-    """Return pose, twist and their deviations; longitude, latitude and height are NaN in a local frame."""
+    """Return pose, twist and their standard deviations; longitude, latitude and height are NaN in a local frame."""
     rotation = matrix_from_quat(found.quat_xyzw)
     rpy = rpy_from_matrix(rotation)
     columns = {f"{name}_rad": rpy[:, k] for k, name in enumerate(("roll", "pitch", "yaw"))}
@@ -133,7 +133,7 @@ def make_wheel_column(wheels: BodyVelocities | None, at_ns: Ints, *, max_gap_ns:
 
 
 def make_command_columns(command: Command | None, at_ns: Ints) -> Arrays:
-    """Return the last command at each stamp; NaN before the first, while the topic is silent, and without commands."""
+    """Return the last command at each stamp; NaN before the first, during a dropout, and without commands."""
     none = np.empty(0)
     command = command or Command(np.empty(0, np.int64), none, none)
     return {
@@ -149,7 +149,7 @@ def make_power_columns(streams: Streams, epoch: int, at_ns: Ints, *, max_gap_ns:
 
 
 def make_rejections_table(sections: Sequence[Section], found: Sequence[Trajectory], fixes: str = GNSS) -> pa.Table:
-    """Return all rejected measurements by time: by the gate, or unusable ones; ``fixes`` is the role of fixes."""
+    """Return all measurements that the gate rejected or that are unusable, by time; ``fixes`` is the role of fixes."""
     parts = [trajectory.rejections for trajectory in found]
     invalid = [(role, each.invalid_ns) for section in sections for role, each in sorted(section.prepared.items())]
     size = sum(stamps.size for _, stamps in invalid)
@@ -168,7 +168,7 @@ def make_rejections_table(sections: Sequence[Section], found: Sequence[Trajector
 
 
 def make_section_facts(section: TrackSection, initial: InitialState, found: Trajectory) -> StretchFacts:
-    """Return the facts of one section: the filter's, and where it lies and began."""
+    """Return the facts of one section: results of the filter, its time span and its start."""
     m = section.measurements
     return replace(
         found.facts,
@@ -183,14 +183,14 @@ def make_section_facts(section: TrackSection, initial: InitialState, found: Traj
 
 
 def find_exclusions(sections: Sequence[Section]) -> list[Finding]:
-    """Return the findings of all excluded sensors; the same of several sections as one, over the time of all."""
+    """Return the findings of excluded sensors; equal findings of several sections are merged over their time span."""
     return merge_findings(finding for place in rank_sections(sections) for finding in sections[place].excluded.values())
 
 
 def merge_findings(findings: Iterable[Finding]) -> list[Finding]:
-    """Return the findings of several sections, those of one code and subject as one that has the first one's numbers.
+    """Merge findings of several sections that have the same code and subject; the numbers are those of the first.
 
-    Time offsets that differ stay apart, and have no remedy: the recipe states one.
+    Time offsets that differ are not merged and have no remedy, because the recipe can state only one.
     """
     merged: list[Finding] = []
     for finding in findings:

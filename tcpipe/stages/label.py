@@ -220,10 +220,8 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
     )
 
 
-_MISMATCH = 0.05
-"""Share of the mean power by which the plain mean of its samples may differ."""
-_EDGE_S = 0.3
-"""After a stop and before a start motors draw."""
+_MISMATCH = 0.05  # share of the mean power by which the plain mean of its samples may differ
+_EDGE_S = 0.3  # after a stop and before a start motors draw
 
 
 def find_idle_power(

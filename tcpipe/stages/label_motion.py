@@ -36,10 +36,8 @@ from tcpipe.tables.levels import Streams, TrackInfo
 
 Arrays = dict[str, Floats]
 
-_ROLLING_MPS = 0.05
-"""Wheels slower than this are stationary: their slip is unknown."""
-_SLIPPING = 0.2
-"""Share of the wheels' speed, a mean along the slope, by which that of the robot may differ."""
+_ROLLING_MPS = 0.05  # wheels slower than this are stationary: their slip is unknown
+_SLIPPING = 0.2  # share of the wheels' speed, a mean along the slope, by which that of the robot may differ
 
 
 def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: TrackInfo, cost: Labels) -> Arrays:

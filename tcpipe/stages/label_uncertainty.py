@@ -200,10 +200,8 @@ def find_negative_idle(
     yield make_finding(_NEGATIVE, _POWER, remedies=remedies, idle_watt=idle.watt, driving_watt=driving_watt)
 
 
-_FEWEST_UNPOWERED = 5
-"""Segments in a row: fewer may be chance."""
-_IDLE_FRACTION = 0.1
-"""Share of the median net power."""
+_FEWEST_UNPOWERED = 5  # segments in a row: fewer may be chance
+_IDLE_FRACTION = 0.1  # share of the median net power
 _MISSING_RESIDUALS = 3.0
 
 
@@ -257,8 +255,7 @@ def make_sensor_error(cut: pa.Table, rails: list[Rail], facts: PowerSensorFacts,
     return SensorError(facts.gain_std_fraction, offset_joule, sign_joule)
 
 
-_MOTION = (*FIXES, WHEELS, VISUAL)
-"""Roles of the independent sensors of motion."""
+_MOTION = (*FIXES, WHEELS, VISUAL)  # roles of the independent sensors of motion
 
 
 def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts) -> NDArray[np.int32]:

@@ -144,8 +144,7 @@ def _find_accelerating(rows: MotionRows, halted: Mask, config: MaskConfig) -> Ma
     return changed | (lasting & unknown) | beside
 
 
-_MOST = 0.5
-"""More than this share of the moving track at one top command makes that the limit of the run."""
+_MOST = 0.5  # more than this share of the moving track at one top command makes that the limit of the run
 
 
 _COMMAND = Subject("role", "command")

@@ -26,8 +26,7 @@ from tcpipe.tables.findings import Finding, Findings, Subject, make_finding
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _GRAVITY_MPS2 = UNITS["m/s2"]["g"]
-_UNSETTLED: Keys = {"sign": "auto", "averaging_unknown": True}
-"""Keys of a current that its name does not determine."""
+_UNSETTLED: Keys = {"sign": "auto", "averaging_unknown": True}  # keys of a current that its name does not determine
 
 
 def find_proposals(log: LogReader, assignment: RoleAssignment, config: ReadConfig, known: Profiles) -> Findings:
@@ -125,8 +124,7 @@ def _judge_imu(found: dict[str, str], values: Mapping[str, Floats]) -> tuple[dic
     return found, ""
 
 
-_FASTEST_MEDIAN_RADPS = 0.3
-"""No robot turns at half of the time as fast as this."""
+_FASTEST_MEDIAN_RADPS = 0.3  # no robot turns at half of the time as fast as this
 
 
 @dataclass(frozen=True, slots=True)

@@ -198,8 +198,7 @@ def _test_by_motion(power_ns: Ints, watt: Floats, motion: pa.Table) -> bool | No
 
 
 _QUANTITIES = {"current": "current_amp", "voltage": "voltage_volt"}
-_BETWEEN_EPOCHS_NS = 1_000_000_000_000
-"""Their stamps may overlap; no reading lasts as long."""
+_BETWEEN_EPOCHS_NS = 1_000_000_000_000  # their stamps may overlap; no reading lasts as long
 
 Streams = dict[str, pa.Table]
 Values = Mapping[str, Floats]

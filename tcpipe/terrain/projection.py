@@ -163,7 +163,7 @@ class Projection:
             x, y = self._transformer.transform(xy[..., 0], xy[..., 1], direction=direction)
         except ProjError as error:
             raise MapError(
-                f"points cannot be taken from {self.source.name!r} to {self.target.name!r}: {error}"
+                f"points cannot be transformed from {self.source.name!r} to {self.target.name!r}: {error}"
             ) from error
         return np.stack([np.asarray(x, float), np.asarray(y, float)], axis=-1)
 

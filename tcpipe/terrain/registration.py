@@ -48,10 +48,8 @@ _BLOCKS, _DRAWS, _FEW_BLOCKS = 12, 200, 1.38
 """Blocks of the path, draws of them, variance factor for few blocks: 12 / 11 times (Student's t / normal)²."""
 _SIGMAS, _OUTLIER, _EDGE_M = 5.0, 3.5, 0.75 * _STEP_M
 """Least decrease of the misfit by a shift [σ]; least outlier [σ]; least step beyond the best inner shift [m]."""
-_CHI2_999 = 13.82
-"""99.9 % of χ² with two degrees of freedom."""
-_LEAST_GAIN = -2.0 * np.log(0.9)
-"""A shift that leaves more than 90 % of the misfit is not what was wrong."""
+_CHI2_999 = 13.82  # 99.9 % of χ² with two degrees of freedom
+_LEAST_GAIN = -2.0 * np.log(0.9)  # A shift that leaves more than 90 % of the misfit is not what was wrong
 _RIDGE = 1e-12  # smallest divisor
 _UNITS = {0.3048: "ft", 0.1: "dm", 0.01: "cm", 0.001: "mm"}
 _UNITS |= {1.0 / metres: "m" for metres in _UNITS}

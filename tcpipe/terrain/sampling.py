@@ -36,8 +36,7 @@ def compute_relief_m(height: NDArray[np.uint16]) -> Floats:
     return np.asarray(steps * HEIGHT_STEP_M)
 
 
-_MOVED_ROWS = 128
-"""Patches moved at once: they stay in the processor's cache on the way."""
+_MOVED_ROWS = 128  # patches moved at once: they stay in the processor's cache on the way
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,14 +1,14 @@
-"""Time offsets between the stamps of a run's sensors, by what they measure of the same motion.
+"""Time offsets between the stamps of a run's sensors, from their measurements of the same motion.
 
 Small offsets are states of the estimator, and steps of a clock are hypotheses of it. Larger offsets are found before
 fusion. Two signals of one motion are shifted against each other until one explains most of the other (`motions`): yaw
-rates, speeds, accelerations. They are compared only where the robot turns or changes its speed: on a straight there is
-nothing to compare but what the controller corrects, and that leads the body. The course of fixes is not compared with
-the gyroscope: an antenna ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
+rates, speeds, accelerations. They are compared only where the robot turns or changes its speed: on a straight line only
+the corrections of the controller remain, and these precede the motion of the body. The course of fixes is not compared
+with the gyroscope: an antenna ahead of the turning point by l precedes the body's course by l / v, 0.1 s for 10 cm.
 
-The pairs together, in windows of at most ten minutes, give each sensor's offset and drift from the clock that most of
-them share. A sensor is blamed only where two others agree against it and no pair contradicts. Clocks up to five minutes
-apart are found first.
+All pairs, in windows of at most ten minutes, determine each sensor's offset and drift from the clock that most sensors
+share. A sensor has a wrong clock only if two other sensors agree with each other, differ from it, and no pair
+contradicts. A coarse search for offsets of up to five minutes runs first.
 """
 
 from __future__ import annotations
@@ -47,14 +47,13 @@ from tcpipe.robust import MIN_SIGMAS
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
 
 ROLES = (IMU, WHEELS, VISUAL, GNSS)
-"""Sensors in the order in which their clocks are taken for the right one: a gyroscope has the least to compute."""
-NOTED_S = 0.05
-"""Least time offset that a person should act on [s]."""
+"""Sensors in the order of preference of their clocks as reference: a gyroscope's driver has the least to compute."""
+NOTED_S = 0.05  # least time offset that a person should act on [s]
 _MIN_EXPLAINED = 0.25
-"""Least share of a signal's variance that another one on the right clock explains: noise and slip are the rest."""
+"""Least share of a signal's variance that another signal with the same clock explains [1]; the rest: noise and slip."""
 _WINDOW_NS, _MIN_WINDOWS = (40_000_000_000, 600_000_000_000), 3
-"""Least and most time without drift [ns], a fifth of the run in between, and number of them that show a drift [1]."""
-_DRIFT_STD = 1e-3  # standard deviation of a clock's drift before the run shows it [1]: ten times that of a quartz
+"""Least and largest window without drift [ns] (a fifth of the run within them); fewest windows to fit a drift [1]."""
+_DRIFT_STD = 1e-3  # prior standard deviation of a clock's drift [1]: ten times that of a quartz
 _COARSE_STD_S = 0.1  # standard deviation of an offset by the coarse search [s]
 
 
@@ -75,16 +74,16 @@ def find_clock_offsets(m: Measurements, *, clock_epoch: int = 0) -> ClockFacts:
 
 
 def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, ClockOffset]:
-    """Return by role the time offset of each sensor from the largest group of sensors that share a clock.
+    """Return, by role, the time offset of each sensor from the largest group of sensors that share a clock.
 
-    Offsets that the fine search cannot find are noted. Without such an offset it returns {}, unless ``always``. Sensors
-    whose offset is unknown are missing.
+    Offsets beyond the range of the fine search are marked as ``noted``. Without any the result is {}, unless
+    ``always``. Sensors with an unknown offset are left out.
     """
     coarse = find_coarse_offsets(m)
     if not always and not any(offset.noted for offset in coarse.values()):
         return {}
-    found = find_clock_offsets(shift_sensors(m, coarse, 0))
-    fine = {found.reference: ClockOffset(0.0, 0.0, noted=False)} | dict(found.offsets)
+    solution = find_clock_offsets(shift_sensors(m, coarse, 0))
+    fine = {solution.reference: ClockOffset(0.0, 0.0, noted=False)} | dict(solution.offsets)
     zero = next((fine[role] for role, each in coarse.items() if each.offset_s == 0.0 and role in fine), None)
     if zero is not None:
         for role in coarse.keys() & fine.keys():
@@ -94,13 +93,15 @@ def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, Clo
 
 
 def find_coarse_offsets(m: Measurements) -> dict[str, ClockOffset]:
-    """Return approximate delays of sensors' stamps against the largest group that shares a clock, with one at 0.
+    """Return approximate delays of sensors' stamps against the largest group that shares a clock; its reference has 0.
 
-    Offsets that the fine search cannot find are noted. Returns {} if the pairs of sensors contradict each other.
+    Offsets beyond the range of the fine search are marked as ``noted``. Returns {} if the pairs of sensors contradict
+    each other.
     """
     pairs = [*_compare_roughly(m)]
-    found = solve_offsets(pairs, near_s=NEAR_S, roles=(*ROLES[1:], IMU))  # an IMU alone makes no track
-    offsets = {found.reference: ClockOffset(0.0, _COARSE_STD_S, noted=False)} | dict(found.offsets)
+    # The IMU comes last: it alone determines no track.
+    solution = solve_offsets(pairs, near_s=NEAR_S, roles=(*ROLES[1:], IMU))
+    offsets = {solution.reference: ClockOffset(0.0, _COARSE_STD_S, noted=False)} | dict(solution.offsets)
     if any(abs(_compute_misfit_s(pair, offsets)) > NEAR_S for pair in pairs if pair.late in offsets):
         return {}
     return {
@@ -111,9 +112,9 @@ def find_coarse_offsets(m: Measurements) -> dict[str, ClockOffset]:
 
 
 def shift_sensors(m: Measurements, offsets: Mapping[str, ClockOffset], middle_ns: int) -> Measurements:
-    """Return measurements whose stamps are without the offsets of their sensors, and the drifts about ``middle_ns``.
+    """Return the measurements with corrected stamps: without time offsets, and without drifts about ``middle_ns``.
 
-    A receiver's velocity has the clock of its fixes.
+    A receiver's velocity has the same clock as its fixes.
     """
     offsets = {**offsets, **({DOPPLER: offsets[GNSS]} if GNSS in offsets else {})}
     off = ((role, sensor) for role, sensor in m.sensors().items() if role in offsets)
@@ -123,7 +124,7 @@ def shift_sensors(m: Measurements, offsets: Mapping[str, ClockOffset], middle_ns
 
 
 def shift_stamps(stamp_ns: Ints, offset: ClockOffset, middle_ns: int) -> Ints:
-    """Return stamps [ns] without an offset and its drift."""
+    """Return stamps [ns] corrected for an offset and its drift."""
     return stamp_ns - np.rint(1e9 * _compute_lateness(offset, compute_seconds(stamp_ns, middle_ns))).astype(np.int64)
 
 
@@ -132,12 +133,12 @@ def _compute_lateness(offset: ClockOffset, from_middle_s: Floats | float) -> Flo
 
 
 def _is_significant(difference_s: float, std_s: float) -> bool:
-    """Return whether a difference of clocks is certain, and large enough that a person should act on it."""
+    """Return whether a clock difference is significant, and large enough that a person should act on it."""
     return bool(abs(difference_s) > max(NOTED_S, MIN_SIGMAS * std_s))
 
 
 def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float, Plane]]) -> list[ClockPair]:
-    """Return two sensors compared: in each window if three show one offset and drift, else over the run."""
+    """Return comparisons of two sensors: one per window if three windows agree on offset and drift, else one."""
     lags = [(at_s, lag) for at_s, sums in windows if (lag := estimate_lag([sums]))]
     pairs = [replace(make_pair(late, against, by, lag), from_middle_s=at_s) for at_s, lag in lags]
     known = [pair for pair in pairs if pair.explained >= _MIN_EXPLAINED and pair.std_s <= NOTED_S]
@@ -151,14 +152,17 @@ def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float,
 
 
 def make_pair(late: str, against: str, by: str, lag: Lag) -> ClockPair:
-    """Return a comparison of two sensors; a determined lag has σ below 0.02 s or a tenth: a stepping clock has more."""
-    std_s = max(lag.std_s, 0.02 if by == "acceleration" else 1e-3)  # slopes act on accelerometers
+    """Return a comparison of two sensors; a lag counts as determined if its σ is below 0.02 s or a tenth of the lag.
+
+    A clock that steps has a larger σ.
+    """
+    std_s = max(lag.std_s, 0.02 if by == "acceleration" else 1e-3)  # slopes disturb accelerometers
     determined = std_s <= max(0.02, 0.1 * abs(lag.offset_s)) and lag.explained >= _MIN_EXPLAINED
     return ClockPair(late, against, by, lag.offset_s, std_s, lag.explained, determined)
 
 
 def _iterate_signals(m: Measurements, at_ns: Ints) -> Iterator[tuple[str, str, str, Signal, Signal]]:
-    """Yield what can be compared: whose stamps against whose, by what, target and regressor on the grid, shape (M,)."""
+    """Yield the possible comparisons: late role, reference role, quantity, and both signals on the grid, shape (M,)."""
     twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
     if m.imu is not None:
         turn, force, _ = resample_imu(m.imu, at_ns)
@@ -179,13 +183,13 @@ def _iterate_signals(m: Measurements, at_ns: Ints) -> Iterator[tuple[str, str, s
 
 
 def _select_near(lively: Floats, values: Signal) -> Signal:
-    """Return values within 2 s of rows in which another signal [rad/s] or [m/s] is beyond 0.1, else NaN, (M,)."""
+    """Return the values within 2 s of a row in which ``lively`` exceeds 0.1 [rad/s or m/s], else NaN; shape (M,)."""
     is_near = compute_moving_mean(1.0 * (np.abs(lively) > 0.1), round(2.0 / GRID_S), least=0.0) > 0.0
     return np.where(is_near, values, np.nan)
 
 
 def _compute_antenna_speed(twist: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
-    """Return the antenna's speed by forward velocity and yaw rate (M, 2) of an odometry [m/s], shape (M,)."""
+    """Return the antenna's speed [m/s], shape (M,), from an odometry's forward velocity and yaw rate (M, 2)."""
     forward, yaw_rate = twist.T
     speed: Floats = np.hypot(forward - yaw_rate * lever_arm_m[1], yaw_rate * lever_arm_m[0])
     return speed
@@ -201,23 +205,22 @@ def solve_offsets(
 ) -> ClockFacts:
     """Return each sensor's offset from the clock of most sensors, by weighted least squares over determined pairs.
 
-    Clocks within ``near_s`` are one. Where as many agree with either of two, that of the first of ``roles`` is taken
-    for the right one.
+    Clocks within ``near_s`` count as one. On a tie, the reference is the role that comes first in ``roles``.
     """
     known = [pair for pair in pairs if pair.determined]
     solved = {
-        role: _solve_against(role, known, span_s) for role in roles if any(role in {p.late, p.against} for p in known)
+        role: _fit_offsets(role, known, span_s) for role in roles if any(role in {p.late, p.against} for p in known)
     }
     if not solved:
         return ClockFacts(clock_epoch, "", tuple(pairs), {})
-    # Sensors near a reference agree with it, however certain: a reference clock with a large σ proves no offset.
+    # Sensors near a reference agree with it whatever their σ: a reference with a large σ proves no offset.
     agreeing = {
         role: {role} | {each for each, of in offsets.items() if abs(of.offset_s) <= near_s and not of.drift_ppm}
         for role, offsets in solved.items()
     }
-    reference = max(solved, key=lambda role: len(agreeing[role]))  # the first of equals
+    reference = max(solved, key=lambda role: len(agreeing[role]))  # on a tie, the first
     offsets = {reference: ClockOffset(0.0, 0.0, noted=False)} | solved[reference]
-    # A sensor is blamed only where two others agree against it and no pair contradicts.
+    # A clock is wrong only if two other sensors agree, differ from it, and no pair contradicts.
     misfits = ((_compute_misfit_s(pair, offsets), pair.std_s) for pair in known if pair.late in offsets)
     is_sure = len(agreeing[reference]) > 1 and not any(_is_significant(*misfit) for misfit in misfits)
     decided = {
@@ -227,8 +230,8 @@ def solve_offsets(
     return ClockFacts(clock_epoch, reference, tuple(pairs), decided)
 
 
-def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) -> dict[str, ClockOffset]:
-    """Return offset and drift of each sensor that pairs connect to the reference; drift only if windows show it."""
+def _fit_offsets(reference: str, pairs: Sequence[ClockPair], span_s: float) -> dict[str, ClockOffset]:
+    """Return offset and drift of each sensor that pairs connect to the reference; only significant drifts."""
     connected = _find_connected(reference, pairs)
     used = [pair for pair in pairs if pair.late in connected]
     free = [role for role in ROLES if role in connected and role != reference]
@@ -238,16 +241,16 @@ def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) ->
     design = np.vstack((np.hstack((signs, signs * at_s[:, None])), prior))
     target = np.concatenate(([p.offset_s for p in used] / std, np.zeros(len(free))))
     inverse = np.linalg.pinv(design)
-    found, stds = inverse @ target, np.sqrt(np.square(inverse).sum(axis=1))
-    # Windows that scatter by more than they claim widen the deviation of a drift (Birge's ratio).
-    birge = max(1.0, float(np.sum(np.square(target - design @ found))) / max(1, len(used) - 2 * len(free)))
+    solution, stds = inverse @ target, np.sqrt(np.square(inverse).sum(axis=1))
+    # If windows scatter by more than their σ, the σ of a drift is inflated (Birge's ratio).
+    birge = max(1.0, float(np.sum(np.square(target - design @ solution))) / max(1, len(used) - 2 * len(free)))
     offsets = {}
     for role, (offset_s, rate), (std_s, rate_std) in zip(
-        free, found.reshape(2, -1).T.tolist(), stds.reshape(2, -1).T.tolist(), strict=True
+        free, solution.reshape(2, -1).T.tolist(), stds.reshape(2, -1).T.tolist(), strict=True
     ):
-        drifts = _is_significant(rate * span_s, np.sqrt(birge) * rate_std * span_s)
-        noted = drifts or _is_significant(offset_s, std_s)
-        offsets[role] = ClockOffset(offset_s, std_s, noted, drift_ppm=1e6 * rate if drifts else 0.0)
+        has_drift = _is_significant(rate * span_s, np.sqrt(birge) * rate_std * span_s)
+        noted = has_drift or _is_significant(offset_s, std_s)
+        offsets[role] = ClockOffset(offset_s, std_s, noted, drift_ppm=1e6 * rate if has_drift else 0.0)
     return offsets
 
 
@@ -268,7 +271,7 @@ def _find_connected(role: str, pairs: Collection[ClockPair]) -> set[str]:
 
 
 def _compare_roughly(m: Measurements) -> Iterator[ClockPair]:
-    """Yield how late sensors' stamps are against each other by speed and turn rate over the liveliest half hour."""
+    """Yield coarse delays between sensors' stamps, by speed and turn rate in the half hour with most motion."""
     at_ns = find_liveliest_window_ns(m)
     if at_ns is None:
         return

@@ -1,7 +1,7 @@
-"""Motion by each sensor on a common grid of time: speed, yaw rate, acceleration and places; and lags between them.
+"""Motion by each sensor on a common time grid: speed, yaw rate, acceleration and position; and lags between them.
 
 The time offset of one signal against another, and the factor between them, come from their correlation at every lag.
-Signals are real, or complex for vectors in the plane, NaN where unknown: masked normalised cross-correlation by FFT
+Signals are real, or complex for vectors in the plane; NaN: unknown. Method: masked normalised cross-correlation by FFT
 (Padfield, CVPR 2010). The lag at which one signal explains most of the other's variance is the offset, refined by a
 parabola. Its standard deviation is that of the delete-a-group jackknife (Miller 1974, Biometrika 61), which needs no
 model of the residuals. The coarse search, over minutes, is by speed and turn rate together.
@@ -27,32 +27,31 @@ from tcpipe.fusion.signals import (
     integrate_signal,
     is_covered,
     remove_spikes,
-    remove_wild_places,
+    remove_xy_spikes,
 )
 
-GRID_S = 0.02
-"""Spacing of the grid [s]."""
+GRID_S = 0.02  # spacing of the grid [s]
 GRID_NS = round(GRID_S * 1e9)
 FIXES_S = 0.5
-"""A velocity is made of fixes averaged over, and taken apart by, this long [s]: their noise is below the motion."""
+"""Averaging time of fixes, and time difference over which they give a velocity [s]: keeps noise below the motion."""
 
 SMOOTH_S, _ACCELERATION_S, _SLOW_S = 0.1, 0.3, 4.0
-"""Averaging times of speeds and yaw rates, and of accelerations; slower changes are also slip and slopes [s]."""
+"""Averaging times of speeds and yaw rates, accelerations, and slow changes (also by slip and slopes) [s]."""
 
 
 def make_grid_ns(first_ns: int, last_ns: int) -> Ints:
-    """Return a grid's stamps [ns] from first to last, two at least."""
+    """Return the grid's stamps [ns] from first to last, at least two."""
     return np.arange(first_ns, max(last_ns, first_ns + GRID_NS) + 1, GRID_NS, dtype=np.int64)
 
 
 def find_span_ns(m: Measurements) -> tuple[int, int] | None:
-    """Return first and last stamp of a set's measurements; None where no sensor has two."""
+    """Return first and last stamp [ns] of all measurements; None if no sensor has two."""
     stamps = [sensor.stamp_ns for sensor in m.sensors().values() if sensor.stamp_ns.size > 1]
     return (min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps)) if stamps else None
 
 
 def iterate_windows_ns(m: Measurements, length_ns: int) -> Iterator[Ints]:
-    """Yield consecutive grids [ns] of about ``length_ns`` over the time of a set, where it has measurements."""
+    """Yield consecutive grids [ns] of about ``length_ns`` that contain measurements."""
     span = find_span_ns(m)
     if span is None:
         return
@@ -71,7 +70,7 @@ def find_liveliest_window_ns(m: Measurements) -> Ints | None:
 
 
 def compute_driven_m(m: Measurements, at_ns: Ints) -> Floats:
-    """Return the distance driven before each time [m], by the first sensor that measures it."""
+    """Return the distance driven until each time [m], by the first sensor that measures it."""
     source, gnss = m.first_odometry, m.gnss
     if source is not None:
         stamp_ns = source.stamp_ns
@@ -102,7 +101,7 @@ def resample_signal(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
 
 
 def resample_twist(source: BodyVelocities, at_ns: Ints) -> Floats:
-    """Return forward velocity and yaw rate (0 if not measured), shape (M, 2), with single wild samples bridged."""
+    """Return forward velocity and yaw rate (0 if not measured), shape (M, 2); single outliers are interpolated."""
     twist = np.column_stack((source.velocity_mps[:, 0], source.yaw_rate_radps))
     if not np.isfinite(twist[:, 1]).any():
         twist[:, 1] = 0.0
@@ -111,27 +110,27 @@ def resample_twist(source: BodyVelocities, at_ns: Ints) -> Floats:
 
 
 def resample_fixes(gnss: Positions, at_ns: Ints) -> Plane:
-    """Return the antenna's places [m], east + i north, averaged over half a second, shape (M,), without wild fixes."""
-    places = remove_wild_places(gnss.position_enu_m).view(np.float64).reshape(-1, 2)
+    """Return the antenna's position [m], east + i north, averaged over half a second, shape (M,), without outliers."""
+    places = remove_xy_spikes(gnss.position_enu_m).view(np.float64).reshape(-1, 2)
     return average(resample_signal(gnss.stamp_ns, places, at_ns) @ np.array([1.0, 1j]), FIXES_S)
 
 
 def compute_fix_velocity(gnss: Positions, at_ns: Ints) -> Plane:
-    """Return the antenna's velocity [m/s], east and i times north, shape (M,); wild fixes are bridged, NaN in gaps."""
+    """Return the antenna's velocity [m/s], east + i north, shape (M,); outliers are interpolated, gaps are NaN."""
     return _differentiate(resample_fixes(gnss, at_ns), np.subtract)
 
 
 def differentiate_course(velocity_mps: Plane) -> Floats:
-    """Return how fast the direction of travel turns [rad/s], shape (M,), NaN below 0.2 m/s.
+    """Return the rate of the direction of travel [rad/s], shape (M,), NaN below 0.2 m/s.
 
-    An antenna ahead of the turning point by l leads the body's course by l / v: good for a sign, not for a clock.
+    An antenna ahead of the turning point by l precedes the body's course by l / v, so the rate shows no offset.
     """
     quick = np.where(np.abs(velocity_mps) > MIN_SPEED_MPS, velocity_mps, np.nan)
     return _differentiate(quick, lambda later, earlier: np.angle(later * np.conj(earlier)))
 
 
 def _differentiate(values: Signal, subtract: Callable[[Signal, Signal], Signal]) -> Signal:
-    """Return the rates of change over `FIXES_S` of values on the grid (M,), by their differences; NaN at the ends."""
+    """Return the rate of change of values on the grid (M,), by differences over `FIXES_S`; NaN at the ends."""
     half = round(FIXES_S / 2 / GRID_S)
     changes = subtract(values[2 * half :], values[: -2 * half]) / (2 * half * GRID_S)
     rates: Signal = np.pad(changes, half, constant_values=np.nan)[: values.size]
@@ -139,9 +138,9 @@ def _differentiate(values: Signal, subtract: Callable[[Signal, Signal], Signal])
 
 
 def resample_imu(imu: InertialMeasurements, at_ns: Ints) -> tuple[Floats, Plane, Floats]:
-    """Return yaw rate, quick horizontal force (forward + i left), (M,) each, and the levelling rotation (3, 3).
+    """Return yaw rate (M,), high-pass horizontal force (forward + i left) (M,), and levelling rotation (3, 3).
 
-    The unit is levelled by the mean direction of its force where this contains gravity.
+    If the specific force contains gravity, its mean direction defines level.
     """
     signals = (imu.angular_velocity_radps, imu.specific_force_mps2)
     rate, force = (resample_signal(imu.stamp_ns, values, at_ns) for values in signals)
@@ -153,18 +152,18 @@ def resample_imu(imu: InertialMeasurements, at_ns: Ints) -> tuple[Floats, Plane,
 
 
 def compute_acceleration(twist: Floats) -> Plane:
-    """Return the quick part of the acceleration of a twist [m/s²], forward + i left (by its turns), shape (M,)."""
+    """Return the high-pass acceleration of a twist [m/s²], forward + i left (centripetal), shape (M,)."""
     speed = average(twist[:, 0], _ACCELERATION_S)
     return find_quick_part(np.gradient(speed, GRID_S) + 1j * speed * average(twist[:, 1], _ACCELERATION_S))
 
 
 def average(values: Signal, width_s: float) -> Signal:
-    """Return the running mean of a signal on the grid, NaN where any of the width is unknown."""
+    """Return the running mean of a signal on the grid, NaN if any value within the width is unknown."""
     return compute_moving_mean(values, round(width_s / GRID_S / 2))
 
 
 def find_quick_part(values: Signal) -> Signal:
-    """Return values without their slow part, which slip and terrain change, and starts, stops and turns do not need."""
+    """Return the high-pass part of a signal: slip and terrain cause slow changes; starts, stops and turns do not."""
     quick: Signal = values - average(values, _SLOW_S)
     return quick
 
@@ -179,19 +178,18 @@ def dead_reckon(twist: Floats) -> Plane:
 
 # Lags between signals
 
-MAX_LAG_S = 1.2
-"""Largest lag of the fine search [s]."""
+MAX_LAG_S = 1.2  # largest lag of the fine search [s]
 _STEPS = round(MAX_LAG_S / GRID_S)
 _GROUPS, _MIN_GROUPS, _MIN_GROUP_S = 20, 4, 2.0
-"""Most and fewest groups of time of the jackknife, and their least length [s]."""
+"""Largest and smallest number of groups of the jackknife [1], and least length of a group [s]."""
 _INDEPENDENT = 10
-"""Rows between independent residuals: signals are smoothed over 0.1 s to 0.2 s; of the coarse search over 5 rows."""
-_TINY = 1e-12  # least variance, and least share of it, that a division bears
+"""Rows between independent residuals [1]: signals are smoothed over 0.1 s to 0.2 s, or over 5 coarse rows."""
+_TINY = 1e-12  # smallest divisor: a variance, or a share of it
 
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """Delay of the target's stamps against the regressor's [s], its standard deviation, explained variance (0 to 1).
+    """Delay of the target's stamps relative to the regressor's [s], its σ, and the explained share of variance [1].
 
     The target is ``factor`` times the regressor; that of vectors in the plane is complex, its angle turns the regressor
     into the target.
@@ -207,20 +205,20 @@ class Lag:
 
 
 def find_lag(target: Signal, regressor: Signal) -> Lag | None:
-    """Return how late the target's stamps are against the regressor's, or None where that is unknown.
+    """Return the delay of the target's stamps relative to the regressor's, or None if it is unknown.
 
-    Signals, shape (M,), are on a grid of `GRID_S`. The lag is unknown where few values are, where the best lag is at
-    the end of the search or another is as good, or where a constant explains the target.
+    Signals, shape (M,), are on a grid of `GRID_S`. The delay is unknown if few values are known, if the best lag is at
+    the end of the search range, if another lag is as good, or if a constant explains the target.
     """
     sums = compute_lag_sums(target, regressor)
     return None if sums is None else estimate_lag([sums])
 
 
 def compute_lag_sums(target: Signal, regressor: Signal) -> Plane | None:
-    """Return sums over target y and regressor x of a window, shape (M,), by groups of equal time and lags.
+    """Return the sums over target y and regressor x of a window, shape (M,), by groups of equal duration and by lag.
 
-    They are of 1, x, |x|², conj(y), conj(y) x and |y|² where both are known, shape (6, G, L). None where the window is
-    too short.
+    The sums are of 1, x, |x|², conj(y), conj(y) x and |y|² over rows with both values, shape (6, G, L). None if the
+    window is too short.
     """
     groups = min(_GROUPS, int((target.size - 2 * _STEPS) * GRID_S / _MIN_GROUP_S))
     if groups < _MIN_GROUPS:
@@ -246,29 +244,29 @@ def estimate_lag(windows: Sequence[Plane]) -> Lag | None:
     rows = total[0, 0].real if groups else np.zeros(1)
     if groups < _MIN_GROUPS or rows.min() < 0.5 * rows.max() or rows.max() * GRID_S < _MIN_GROUP_S:
         return None
-    # The whole first, then all but one group.
-    explained, factors = _explain_target(np.concatenate((total, total - sums), axis=1))
-    offsets_s, best = [GRID_S * _find_peak(each) for each in explained], int(np.argmax(explained[0]))
-    if not np.isfinite(offsets_s).all() or _has_rival(explained[0], best, float(rows.max()) / _INDEPENDENT):
+    # First all groups, then all but one.
+    explained_share, factors = _compute_explained_share(np.concatenate((total, total - sums), axis=1))
+    offsets_s, best = [GRID_S * _find_peak(each) for each in explained_share], int(np.argmax(explained_share[0]))
+    if not np.isfinite(offsets_s).all() or _has_rival(explained_share[0], best, float(rows.max()) / _INDEPENDENT):
         return None
     std_s = float(np.sqrt((groups - 1) * np.var(offsets_s[1:])))
-    return Lag(offsets_s[0], std_s, float(explained[0, best]), complex(factors[0, best]))
+    return Lag(offsets_s[0], std_s, float(explained_share[0, best]), complex(factors[0, best]))
 
 
-def _explain_target(sums: Plane) -> tuple[Floats, Plane]:
-    """Return the share of a target's variance that its regressor explains (0 if constant), and the factor, (G, L)."""
+def _compute_explained_share(sums: Plane) -> tuple[Floats, Plane]:
+    """Return the explained share of the target's variance (0 if constant), and the regressor's factor; (G, L)."""
     n, x, xx, y, yx, yy = sums
     count = np.maximum(np.rint(n.real), 1.0)
     target, regressor = yy.real - np.abs(y) ** 2 / count, xx.real - np.abs(x) ** 2 / count
     product = np.conj(yx - y * x / count)
     varies = (target > _TINY) & (regressor > _TINY)
     target, regressor = np.where(varies, target, 1.0), np.where(varies, regressor, 1.0)
-    explained = np.where(varies, np.minimum(np.abs(product) ** 2 / (target * regressor), 1.0 - _TINY), 0.0)
-    return explained, product / regressor
+    explained_share = np.where(varies, np.minimum(np.abs(product) ** 2 / (target * regressor), 1.0 - _TINY), 0.0)
+    return explained_share, product / regressor
 
 
 def _find_peak(values: Floats) -> float:
-    """Return the rows from the middle to the maximum, by a parabola through its neighbours; NaN at the ends."""
+    """Return the rows from the middle to the maximum, refined by a parabola through its neighbours; NaN at the ends."""
     best = int(np.argmax(values))
     if best in {0, values.size - 1}:
         return float("nan")
@@ -276,24 +274,23 @@ def _find_peak(values: Floats) -> float:
     return float(best - values.size // 2 + 0.5 * (after - before) / max(2.0 * at - before - after, _TINY))
 
 
-def _has_rival(explained: Floats, best: int, independent: float) -> bool:
-    """Return whether another peak is about as high: a motion that repeats itself shows no lag."""
-    inner = explained[1:-1]
-    peaks = 1 + np.flatnonzero((inner >= explained[:-2]) & (inner >= explained[2:]))
-    others = explained[peaks[np.abs(peaks - best) > 1]]
-    worse = independent * np.log((1.0 - others) / (1.0 - explained[best]))
-    return bool((worse < 10.83).any())  # 99.9 % of χ² with one degree of freedom
+def _has_rival(explained_share: Floats, best: int, independent: float) -> bool:
+    """Return whether another peak is almost as high, judged by the number of ``independent`` rows."""
+    inner = explained_share[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= explained_share[:-2]) & (inner >= explained_share[2:]))
+    others = explained_share[peaks[np.abs(peaks - best) > 1]]
+    log_ratio = independent * np.log((1.0 - others) / (1.0 - explained_share[best]))
+    return bool((log_ratio < 10.83).any())  # 99.9 % of χ² with one degree of freedom
 
 
 # Clocks that are seconds to minutes apart
 
 _COARSE_S = 0.2  # spacing of the rows of the coarse search [s]
-NEAR_S = MAX_LAG_S - _COARSE_S
-"""Largest lag that the fine search surely finds [s]."""
+NEAR_S = MAX_LAG_S - _COARSE_S  # largest lag that the fine search finds reliably [s]
 
 
 def prepare_coarse_signals(speed_mps: Floats, turn_radps: Floats) -> Floats:
-    """Return speed and turn rate for `find_coarse_lag`, (2, N): means over 1 s less those over 30 s, 0 if unknown."""
+    """Return speed and turn rate for `find_coarse_lag`, (2, N): means over 1 s less means over 30 s, 0 if unknown."""
     rows = np.stack((speed_mps, turn_radps))[:, : speed_mps.size // 10 * 10].reshape(2, -1, 10).mean(2).T
     smooth = np.where(np.isfinite(rows), compute_moving_mean(rows, 2, least=0.0), np.nan)
     quick: Floats = np.nan_to_num(smooth - compute_moving_mean(smooth, 75, least=0.0)).T
@@ -301,7 +298,7 @@ def prepare_coarse_signals(speed_mps: Floats, turn_radps: Floats) -> Floats:
 
 
 def find_coarse_lag(late: Floats, against: Floats) -> float | None:
-    """Return the delay of one sensor's stamps against another's [s], None if unknown; signals have shape (2, N)."""
+    """Return the delay of one sensor's stamps relative to another's [s], None if unknown; signals have shape (2, N)."""
     most = round(300.0 / _COARSE_S)  # five minutes
     size = 1 << (late.shape[1] + most).bit_length()
     spectra = np.fft.rfft(late, size) * np.conj(np.fft.rfft(against, size))
@@ -309,9 +306,9 @@ def find_coarse_lag(late: Floats, against: Floats) -> float | None:
     shares = np.fft.irfft(spectra, size) / np.maximum(power, _TINY)[:, None]
     correlation = np.concatenate((shares[:, -most:], shares[:, : most + 1]), axis=1).sum(0)
     best, lag_s = int(np.argmax(correlation)), _COARSE_S * _find_peak(correlation)
-    # Noise reaches 4 σ in 3,000 lags. Repeated lanes have several peaks that are about as high.
+    # Noise reaches 4σ in 3,000 lags. Repeated lanes cause several peaks of similar height.
     is_noise = float(correlation[best]) * np.sqrt(late.shape[1] / _INDEPENDENT) < 6.0
     apart = np.abs(np.arange(correlation.size) - best) * _COARSE_S > 3.0
-    # A rival explains as much on drives that repeat themselves; judged on simulated drives.
+    # On periodic drives another lag explains as much; threshold from simulated drives.
     has_rival = abs(lag_s) > NEAR_S and float(correlation[apart].max()) > 0.7 * float(correlation[best])
     return None if is_noise or np.isnan(lag_s) or has_rival else lag_s

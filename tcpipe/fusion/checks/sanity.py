@@ -1,11 +1,11 @@
-"""Sensors that cannot be right: frozen, too slow, in another unit, mounted otherwise, or unlike the other sensors.
+"""Find implausible sensors: frozen, too slow, in other units, mounted differently, or in conflict with other sensors.
 
-Sensors are compared in pairs by three quantities: the distance that they drive, how they turn, and whether they drive
-forward. Of two that differ, the one that fewer others confirm is excluded; both are, on a tie. Two facts need no second
-sensor of motion: gravity shows the tilt of an IMU, and the size of its specific force the unit. An odometry's
-accelerations show the yaw of an IMU.
+Sensors are compared in pairs by three quantities: driven distance, turn rate, and direction (forward or backward). If
+two differ, the one that fewer other sensors confirm is excluded; on a tie, both. Two checks need no second motion
+sensor: gravity determines the tilt of an IMU, and the norm of its specific force the unit. The accelerations of an
+odometry determine the yaw of an IMU.
 
-Nothing else is decided before fusion: a section that its sensors do not explain is doubted as a whole afterwards.
+All other conflicts are judged after fusion, for a whole section.
 """
 
 from __future__ import annotations
@@ -37,16 +37,15 @@ from tcpipe.fusion.signals import Plane, hold_last
 from tcpipe.fusion.state import GRAVITY_MPS2
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 
-COMMAND = "command"
-"""The command among the sensors; it is never excluded."""
+COMMAND = "command"  # name of the command in comparisons; it is never excluded
 _CONTRADICTIONS = {
     "distance": ("distance-contradicted", (0.5, 2.0), None),
     "turn": ("yaw-rate-sign", (0.0, np.inf), np.diag([1.0, -1.0, -1.0])),
     "direction": ("drives-backwards", (0.0, np.inf), np.diag([-1.0, -1.0, 1.0])),
 }
-"""By quantity: code of the finding, ratios of sensors that agree [1], and the rotation that corrects an odometry."""
+"""By quantity: code of the finding, ratio range of sensors that agree [1], rotation that corrects an odometry."""
 CONSTANT_FAULTS = frozenset({"drives-backwards", "imu-rotated", "imu-units", "yaw-rate-sign"})
-"""Codes of exclusions for units and mounting, which no restart of a clock changes."""
+"""Codes of exclusions for units and mounting: they are the same in every clock epoch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +55,9 @@ class SensorExclusion:
     Attributes
     ----------
     code, names, numbers : of the finding; the name ``suspect`` is the other role that may be wrong instead.
-    units : value of the recipe's ``imu_units`` that sets it right.
-    turned_by : rotation (3, 3) from what the extrinsics in use make of the sensor to base_link.
-    scale : of an odometry, how many times as far as the fixes it drives.
+    units : value of the recipe's ``imu_units`` that corrects it.
+    turned_by : rotation (3, 3) from the sensor's axes by the current extrinsics to base_link.
+    scale : distance by the odometry over distance by the fixes [1].
     """
 
     role: str
@@ -70,8 +69,7 @@ class SensorExclusion:
     scale: float | None = None
 
 
-Exclusions = dict[str, SensorExclusion]
-"""By role, in order."""
+Exclusions = dict[str, SensorExclusion]  # by role, in order
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,14 +82,14 @@ class Command:
 
 
 def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bool, felt: float) -> Exclusions:
-    """Return which sensors of a clock epoch are not to be fused.
+    """Return the sensors of a clock epoch to be excluded from fusion, with the reasons.
 
     Parameters
     ----------
-    m : measurements in base_link axes, by the extrinsics in use.
+    m : measurements in base_link axes, by the current extrinsics.
     is_imu_stated : whether the extrinsics of the IMU are stated (recipe, transforms, message in base_link) rather than
     assumed.
-    felt : median size of the specific force as the IMU measured it, before its lever arm was taken out; NaN without an
+    felt : median norm of the specific force as measured, not corrected for the lever arm; NaN without an
     IMU.
     """
     found: Exclusions = {}
@@ -118,7 +116,7 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
         turn, force, level = resample_imu(m.imu, at_ns)
         rates = {IMU: turn, **rates}
         yaws_rad = _find_yaws(force, twists) if m.imu.accelerometer_usable else {}
-    # Over 2 s the noise of centimetres in fixes is below a turn; the mean is the bias of a gyroscope.
+    # Over 2 s the noise of RTK fixes is below a turn; the mean is the bias of a gyroscope.
     smooth = {role: average(rate, 2.0) for role, rate in rates.items() if role not in found}
     turns = _compare_signals(smooth, centred=True)
     turn_ratios = [abs(ratio) for pair, ratio in turns.items() if IMU in pair]
@@ -126,7 +124,7 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
     if wrong is not None:
         found[IMU], turn, yaws_rad = wrong, np.empty(0), {}
         turns = {pair: ratio for pair, ratio in turns.items() if IMU not in pair}
-    # 3. Distances, by the turns of the gyroscope if there is one, and directions of pairs.
+    # 3. Distances and directions of pairs, with the turns of the gyroscope if there is one.
     for role, twist in twists.items() if turn.size else ():
         twist[:, 1] = np.where(np.isfinite(turn), turn, twist[:, 1])
         paths[role] = dead_reckon(twist)
@@ -145,16 +143,16 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
 
 
 def _find_slow_rate_hz(stamp_ns: Ints) -> float | None:
-    """Return the median rate of an IMU whose samples are mostly too rare to show the motion, without pauses."""
+    """Return the median rate of an IMU if most of its periods are too long to measure the motion, without pauses."""
     step_s = np.diff(stamp_ns) * 1e-9
     known_s = step_s[step_s <= PAUSE_NS * 1e-9]
-    # 10 Hz, with the jitter of its driver.
+    # 10 Hz, with a margin for jitter of the driver.
     is_slow = step_s.size > 0 and float(known_s[known_s < 0.11].sum()) <= 0.5 * float(known_s.sum())
     return 1.0 / float(np.median(step_s)) if is_slow else None
 
 
 def _list_constants(m: Measurements) -> Iterator[tuple[str, str, int]]:
-    """Yield sensors with a quantity that is constant to the last digit, the quantity, and the number of messages."""
+    """Yield each quantity that is exactly constant: sensor, quantity, and number of messages."""
     values = [(role, "velocity", source.velocity_mps) for role, source in m.odometries().items()]
     values += [] if m.gnss is None else [(GNSS, "position", m.gnss.position_enu_m)]
     if m.imu is not None:
@@ -171,19 +169,19 @@ def _list_constants(m: Measurements) -> Iterator[tuple[str, str, int]]:
 
 
 def _find_yaws(force: Plane, twists: Mapping[str, Floats]) -> dict[str, float]:
-    """Return by odometry the yaw of the levelled IMU [rad] where accelerations show it."""
+    """Return by odometry the yaw of the levelled IMU [rad], if accelerations determine it."""
     lags = {role: find_lag(compute_acceleration(twist), force) for role, twist in twists.items()}
-    # Slopes act on accelerometers, so little is explained; judged.
+    # Slopes disturb accelerometers, so the explained share is small; threshold by judgement.
     return {role: float(np.angle(lag.factor)) for role, lag in lags.items() if lag and lag.explained > 0.1}
 
 
 def _check_units(turn: Floats, ratios: Sequence[float], felt: float) -> SensorExclusion | None:
-    """Return the exclusion of an IMU in other units, by the ratios of others' yaw rates to its, and the force."""
+    """Return the exclusion of an IMU in other units, by ratios of yaw rates (others to its own) and its force."""
     names, numbers = [], dict[str, float]()
     rate_radps = np.abs(turn[np.isfinite(turn)])
     if ratios and np.median(ratios) < 1.0 / 15.0:  # 1/57 in degrees
         names, numbers = ["deg"], {"turn_ratio": 1.0 / float(np.median(ratios))}
-    elif not ratios and np.count_nonzero(rate_radps > 15.0) > 0.005 * turn.size:  # no robot turns as fast
+    elif not ratios and np.count_nonzero(rate_radps > 15.0) > 0.005 * turn.size:  # no robot turns this fast
         names, numbers = ["deg"], {"rate_max": float(rate_radps.max())}
     low, high = GRAVITY_BAND_MPS2
     if low <= felt * GRAVITY_MPS2 <= high:
@@ -193,9 +191,9 @@ def _check_units(turn: Floats, ratios: Sequence[float], felt: float) -> SensorEx
 
 
 def _check_mounting(level: Floats, yaws_rad: Mapping[str, float]) -> SensorExclusion | None:
-    """Return the exclusion of an IMU that is tilted by the rotation that levels it, or looks aside by accelerations."""
+    """Return the exclusion of an IMU that is tilted (by gravity) or rotated about the vertical (by accelerations)."""
     tilt_rad = float(np.arccos(np.clip(level[2, 2], -1.0, 1.0)))
-    by_gravity = tilt_rad > np.radians(30.0)  # slopes average out, and the steepest that is driven is 22.5°
+    by_gravity = tilt_rad > np.radians(30.0)  # slopes average out; the steepest driven slope is 22.5°
     is_aside = yaws_rad and all(abs(np.cos(each)) < 0.5 for each in yaws_rad.values())
     if not by_gravity and not is_aside:
         return None
@@ -207,7 +205,7 @@ def _check_mounting(level: Floats, yaws_rad: Mapping[str, float]) -> SensorExclu
 
 
 def find_nearest_mounting(base_from_sensor: Floats) -> Floats:
-    """Return the nearest rotation (3, 3) with axes along axes, or the given one if none is within about 14°."""
+    """Return the nearest rotation (3, 3) by multiples of 90°, or the given one if none is within about 14°."""
     aligned = np.round(base_from_sensor)
     return aligned if np.abs(aligned - base_from_sensor).max() < 0.25 else base_from_sensor
 
@@ -217,17 +215,17 @@ def find_nearest_mounting(base_from_sensor: Floats) -> Floats:
 Ratios = dict[tuple[str, str], float]
 """Ratio of a quantity of two sensors, second over first, negative for the other sign [1]."""
 _MAX_SCALE = 5.0
-"""Ratio of distances up to which an odometry has another scale; beyond it the two have nothing in common [1]."""
+"""Largest ratio of distances that a wrong scale explains [1]; beyond it the two measure different motions."""
 
 
 def _compute_noise_m2(gnss: Positions | None) -> float:
-    """Return the mean square that the noise of fixes adds to a path [m²]."""
+    """Return the mean square by which the noise of fixes lengthens a path [m²]."""
     return 0.0 if gnss is None else 2.0 * float(np.median(gnss.variance_m2[:, :2]))
 
 
 def compute_distance_ratio(a: Plane, b: Plane, noise_m2: float) -> float | None:
-    """Return the length of path b over path a, in windows as short as the noise of fixes allows; None if both stand."""
-    step_s = 0.5  # between places that are compared
+    """Return the ratio of lengths of paths b and a, in windows as short as the noise allows; None without motion."""
+    step_s = 0.5  # between compared positions
     both = np.stack((a, b))[:, :: round(step_s / GRID_S)]
     for window_s in (20.0, 60.0, 180.0):
         size = round(window_s / step_s)
@@ -235,24 +233,23 @@ def compute_distance_ratio(a: Plane, b: Plane, noise_m2: float) -> float | None:
             return None
         rows = np.lib.stride_tricks.sliding_window_view(both, size, axis=1)[:, :: size // 4]
         square_m2 = rows[:, np.isfinite(rows.sum((0, 2)))].var(axis=2)
-        far = (square_m2 > 1.0 + 2.0 * noise_m2).any(0)  # further than a metre
+        far = (square_m2 > 1.0 + 2.0 * noise_m2).any(0)  # moved by more than a metre
         if far.sum() >= 3:
             a_m, b_m = np.sqrt(np.median(square_m2[:, far], axis=1))
             return float(max(b_m, 1e-3) / max(a_m, 1e-3))
     return None
 
 
-_MIN_CORRELATION = 0.7
-"""Least correlation of two signals of one motion [1]: one explains half of the other."""
+_MIN_CORRELATION = 0.7  # least correlation of two signals of one motion [1]: one explains half of the other
 
 
 def _compare_signals(signals: Mapping[str, Floats], *, centred: bool = False) -> Ratios:
-    """Return the factors between correlated signals on the grid (M,); ``centred``: without their means."""
+    """Return the factors between correlated signals on the grid (M,); ``centred``: subtract their means first."""
     ratios = {}
     for a, b in combinations(signals, 2):
         both = np.stack((signals[a], signals[b]))
         both = both[:, np.isfinite(both).all(0)]
-        if both.shape[1] * GRID_S < 5.0:  # a few metres show nothing
+        if both.shape[1] * GRID_S < 5.0:  # a few metres are not enough
             continue
         x, y = both - both.mean(axis=1, keepdims=True) if centred else both
         power, product, other = (float(np.sum(each)) for each in (x * x, x * y, y * y))
@@ -268,11 +265,11 @@ def _exclude(
     trust: Mapping[str, float],
     turning: Collection[tuple[str, str]] = (),
 ) -> None:
-    """Exclude of each pair that differs the sensor that fewer confirm; both on a tie.
+    """Exclude from each pair in conflict the sensor that fewer other sensors confirm; on a tie, both.
 
-    ``trust`` counts as confirmations. Fixes are right about the scale of an odometry that no other confirms. Of two
-    sensors whose distances have nothing in common, turns that agree with those of others, the pairs ``turning``,
-    confirm one as well.
+    ``trust`` counts as extra confirmations. If only fixes can check the scale of an odometry, the fixes are right. If
+    two sensors measure unrelated distances, agreement of their turns with other sensors (the pairs ``turning``) also
+    confirms a sensor.
     """
     code, (low, high), turned_by = _CONTRADICTIONS[quantity]
     same = [pair for pair, ratio in ratios.items() if low <= ratio <= high]
@@ -300,7 +297,7 @@ def _exclude(
 
 
 def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
-    """Return why the receiver's velocity of a clock epoch is not to be fused; None where the fixes confirm it."""
+    """Return why the receiver's velocity of a clock epoch is excluded from fusion; None if the fixes confirm it."""
     at_ns = find_liveliest_window_ns(m)
     if m.doppler is None or at_ns is None:
         return None

@@ -11,7 +11,7 @@ from unit.fusion import drive
 from tcpipe.errors import FusionError
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
-from tcpipe.fusion.measurements import GNSS, NO_TRUST, VISUAL, WHEELS, BodyVelocities, Measurements
+from tcpipe.fusion.measurements import GNSS, MAX_VARIANCE, VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import SCALE_STD
 
 PERIOD_NS = 50_000_000
@@ -121,7 +121,7 @@ def test_any_sensor_may_be_missing_or_weak(faults, xy_m, forward_mps, yaw_deg):
 def test_fixes_without_heights_measure_the_plane(others):
     m = drive.measure(truth(), 1, **others)
     variance = m.gnss.variance_m2.copy()
-    variance[:, 2] = NO_TRUST
+    variance[:, 2] = MAX_VARIANCE
     flat = replace(m.gnss, position_enu_m=m.gnss.position_enu_m * [1.0, 1.0, 0.0], variance_m2=variance)
     found = fuse(replace(m, gnss=flat))
     at_s = (found.stamp_ns - drive.ZERO_NS) * 1e-9

@@ -13,7 +13,7 @@ from tcpipe.fusion.filter_kernel import GateVerdict, Memory, TickInputs, allocat
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
 from tcpipe.fusion.smoother_kernel import (
-    LINK_EVERY,
+    DISPLACEMENT_INTERVAL_TICKS,
     Adjoint,
     Candidates,
     Smoothed,
@@ -305,17 +305,17 @@ def test_filter_and_smoother_solve_the_least_squares_problem_of_all_ticks(monkey
             found.variances[k, 3], rel=0.02
         )
         for column, lag in enumerate((10, 20, 40)):
-            if k + lag >= len(maps) or (k + lag) % LINK_EVERY:
-                assert np.isnan(found.links[k, column])
+            if k + lag >= len(maps) or (k + lag) % DISPLACEMENT_INTERVAL_TICKS:
+                assert np.isnan(found.displacement_m2[k, column])
                 continue
             after = states[k + lag][:9].reshape(3, 3) @ maps[k + lag][3:6]
             between = (after - R @ maps[k][3:6])[:2]
             along = states[k + lag][9:11] - states[k][9:11]
             along /= np.linalg.norm(along)
             variance = along @ between @ covariance @ between.T @ along
-            assert variance == pytest.approx(found.links[k, column], rel=0.02)
+            assert variance == pytest.approx(found.displacement_m2[k, column], rel=0.02)
     spread = np.sqrt(np.diag(maps[0] @ covariance @ maps[0].T))
-    assert spread == pytest.approx(found.spreads[0], rel=0.01)
+    assert spread == pytest.approx(found.stds[0], rel=0.01)
 
 
 @settings(max_examples=12, deadline=None)
@@ -347,7 +347,7 @@ def test_what_no_measurement_shows_keeps_its_prior_and_what_is_exact_stays(seed,
     stamp_ns = np.arange(30, dtype=np.int64) * 50_000_000
     ticks = Ticks(stamp_ns, inputs, {}, np.ones((30, 3)))
     smoothed, _ = smooth_section(filter_section(ticks, model, Memory(x, np.diag(std**2), np.zeros((state.KINDS, 2)))))
-    assert np.array_equal(smoothed.spreads[0, hidden], np.sqrt(std[hidden] ** 2))
+    assert np.array_equal(smoothed.stds[0, hidden], np.sqrt(std[hidden] ** 2))
     places = model.active[hidden] + 6
     assert np.array_equal(smoothed.states[:, places], np.tile(x[places], (30, 1)))
 

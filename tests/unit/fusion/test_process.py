@@ -9,7 +9,7 @@ from unit.fusion import drive
 from unit.fusion.test_error_state import fuse, truth
 
 from tcpipe.fusion.preparation import inflate_jittery_fixes, prepare_imu
-from tcpipe.fusion.process import make_motion_noise, turn_scale_std
+from tcpipe.fusion.process import find_turn_scale_std, make_motion_noise
 from tcpipe.fusion.state import Mode
 
 
@@ -55,12 +55,12 @@ def test_without_an_imu_the_velocity_may_change_where_every_odometry_says_so():
 
 def test_a_turn_rate_has_a_scale_to_be_found():
     with_imu, without = measured(), measured(imu=False)
-    assert turn_scale_std(replace(with_imu, gnss=None)) == 0.0
+    assert find_turn_scale_std(replace(with_imu, gnss=None)) == 0.0
     rate = with_imu.imu.angular_velocity_radps
     found = fuse(replace(with_imu, imu=replace(with_imu.imu, angular_velocity_radps=1.05 * rate)))
     assert 1.0 / (1.0 - found.facts.parameters["turn scale"].value[0]) == pytest.approx(1.05, abs=0.005)
     assert drive.errors(truth(), found)["yaw_deg"] < 0.5
-    assert turn_scale_std(without) > 0.1
+    assert find_turn_scale_std(without) > 0.1
     found = fuse(without)
     (value,) = found.facts.parameters["turn scale"].value
     assert 1.0 / (1.0 - value) == pytest.approx(0.8, abs=0.03)

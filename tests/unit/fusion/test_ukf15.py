@@ -13,7 +13,7 @@ from tcpipe.fusion.filter_kernel import allocate_steps, filter_ticks
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import make_model, make_priors, make_start
-from tcpipe.fusion.smoother_kernel import SELDOM
+from tcpipe.fusion.smoother_kernel import STD_INTERVAL
 from tcpipe.fusion.state import Error
 from tcpipe.fusion.ticks import build_ticks
 from tcpipe.fusion.ukf15 import filter_forward, run_ukf15
@@ -116,7 +116,7 @@ def test_filterpy_and_the_compiled_kernel_agree(truth, absent):
     steps, tests = allocate_steps(size, model.active.size), make_tests(size)
     filter_ticks(0, size, ticks.inputs, model, start.copy(), steps, tests)
     std = np.sqrt(np.diagonal(steps.P, axis1=1, axis2=2))
-    assert estimate.spreads == pytest.approx(std[::SELDOM], rel=0.01)
+    assert estimate.stds == pytest.approx(std[::STD_INTERVAL], rel=0.01)
     apart = np.concatenate([reference.minus(*pair)[None] for pair in zip(estimate.states, steps.x, strict=True)])
     assert np.abs(apart[:, model.active] / std).max() < 0.6
     assert _rms(apart[:, model.active] / std).max() < 0.2
