@@ -345,7 +345,7 @@ def _count_workers(client: Client, address: str) -> int:
         raise UsageError(f"{address}: the scheduler has no workers after {_ANSWER_S} s; start one: {start}") from None
     threads = client.nthreads()
     if many := [worker for worker, count in threads.items() if count != 1]:
-        raise UsageError(f"{many[0]}: has {threads[many[0]]} threads; expected one a worker: {start}")
+        raise UsageError(f"{many[0]}: has {threads[many[0]]} threads; expected one thread per worker: {start}")
     # Not a function of tcpipe: a worker that lacks it would end when it is handed one.
     for worker, version in client.run(eval, "__import__('tcpipe').__version__", on_error="return").items():
         if isinstance(version, ImportError):

@@ -319,7 +319,9 @@ def acknowledge(names: tuple[str, ...], *, store: str) -> Acknowledged:
 @click.argument("runs", nargs=-1, metavar="[RUN]...", shell_complete=complete_runs)
 @store_option
 @recipe_option
-@click.option("--forget", multiple=True, metavar="OUT", help="Remove what only this deleted dataset needs; repeatable.")
+@click.option(
+    "--forget", multiple=True, metavar="OUT", help="Remove the files that only this deleted dataset needs; repeatable."
+)
 @click.option("--dry-run", is_flag=True, help="Print what would be removed; change nothing.")
 @add_output()
 def prune(*, runs: tuple[str, ...], store: str, recipe: str | None, forget: tuple[str, ...], dry_run: bool) -> Pruned:

@@ -68,8 +68,8 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     help="Kind of model; repeatable (default: all).",
 )  # fmt: skip
 @click.option("--seeds", default=5, type=click.IntRange(1, 100), help="Trainings of each network.")
-@click.option("--out", default="benchmark", type=OUTPUT_DIRECTORY, help="Where tables, models and evaluations go.")
-@click.option("--predictor", metavar="FILE.py[:NAME]", help="Your own model, which joins the kinds.")
+@click.option("--out", default="benchmark", type=OUTPUT_DIRECTORY, help="Directory of tables, models and evaluations.")
+@click.option("--predictor", metavar="FILE.py[:NAME]", help="Your own model, compared with the other kinds.")
 @add_output("benchmark", as_values=True)
 def benchmark(
     datasets: Sequence[str], *, kinds: Sequence[ModelKind], seeds: int, out: str, predictor: str | None
@@ -91,7 +91,7 @@ def benchmark(
     "--size",
     type=click.Choice(["full", "small", "quick"]),
     default="full",
-    help="The paper's site; a small site and a narrow network; or these for a few epochs, to see it run.",
+    help="The paper's site; a small site with a narrow network; or the small site for a few epochs, as a test.",
 )
 @click.option(
     "--seeds", default=1, type=click.IntRange(1, 100), help="Number of trainings; five or more decide the claims."
@@ -99,7 +99,7 @@ def benchmark(
 @jobs_option("Logs read")
 @click.option(
     "--baselines/--no-baselines", default=True,
-    help="Train networks of each class alone, with all layers and as Wei and Isler, which take most of the time.",
+    help="Also train networks on single classes, with all layers, and as Wei and Isler (takes most of the time).",
 )  # fmt: skip
 @add_output("reproduce")
 def reproduce(directory: str, *, size: Size, seeds: int, jobs: int, baselines: bool) -> Reproduction:

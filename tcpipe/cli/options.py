@@ -301,7 +301,7 @@ def add_path_or_run(name: str, metavar: str, *, required: bool) -> Option:
 
             given = values[name]
             if given and is_path(given) and context.get_parameter_source("store") is ParameterSource.COMMANDLINE:
-                raise UsageError(f"{given}: is a path, and --store is where a run is looked up; give one of them")
+                raise UsageError(f"{given}: is a path, and --store is only for names of runs; remove one of them")
             values[name] = context.params[name] = given or store
             return run(store=store, **values)
 

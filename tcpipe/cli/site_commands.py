@@ -43,7 +43,7 @@ def demo(directory: str, *, seed: int, quiet: bool) -> None:
 @click.command()
 @click.argument("directory", default=".", type=OUTPUT_DIRECTORY, metavar="[DIR]")
 @click.option(
-    "--from", "source", type=LOG, metavar="PATH", help="A log, or a folder of tables, whose content the recipe states."
+    "--from", "source", type=LOG, metavar="PATH", help="Log, or folder of tables, from which the recipe is proposed."
 )
 @robot_option()
 @msgdef_option

@@ -37,7 +37,7 @@ def fetch_cached(key: str, fetch: Callable[[Path], object]) -> Path:
         # Not synced: readers compare checksums. What a killed process leaves is removed in its turn.
         temporary.replace(path)
     except OSError as error:
-        message = f"{path}: cannot be written ({error.strerror or error}); TCPIPE_CACHE names another place for what is fetched"
+        message = f"{path}: cannot be written ({error.strerror or error}); set TCPIPE_CACHE to use another directory for downloads"
         raise StoreError(message) from error
     finally:
         with suppress(OSError):

@@ -457,5 +457,5 @@ def read_sample_ids(path: Path) -> list[str]:
     texts = lines if column is None else [row[column] for row in rows[1:] if len(row) > column]
     ids = list(dict.fromkeys(text.strip() for text in texts if text.strip()))
     if not ids:
-        raise DatasetError(f"{path}: contains no sample id; expected a column sample_id, or one id a line")
+        raise DatasetError(f"{path}: contains no sample id; expected a column sample_id, or one id per line")
     return ids

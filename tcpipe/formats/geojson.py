@@ -60,7 +60,9 @@ def read_regions(path: Path) -> Regions:
     if not problems and not any(polygons.values()):
         problems.append(f"{path}: no polygon in it; draw the region that trains and tests as a polygon")
     if not problems and not polygons["train_test"]:
-        problems.append(f"{path}: every feature is unseen or exclude: nothing could train; add a train_test polygon")
+        problems.append(
+            f"{path}: every feature is unseen or exclude: no region is left for training; add a train_test polygon"
+        )
     if not problems:
         problems += _find_disagreements(path, polygons)
     if problems:
@@ -123,11 +125,13 @@ def _parse_document(path: Path) -> Mapping[str, Json]:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            raise RegionError(f"{path}: {size / 1e6:.0f} MB of GeoJSON, at most {MAX_BYTES // 10**6}{_SIMPLER}")
+            raise RegionError(
+                f"{path}: {size / 1e6:.0f} MB of GeoJSON, expected at most {MAX_BYTES // 10**6}{_SIMPLER}"
+            )
         text = path.read_text(encoding="utf-8-sig")
         values = text.count("[") + text.count("{")
         if values > MAX_VALUES:
-            raise RegionError(f"{path}: {values} positions, rings and objects, at most {MAX_VALUES}{_SIMPLER}")
+            raise RegionError(f"{path}: {values} positions, rings and objects, expected at most {MAX_VALUES}{_SIMPLER}")
         document = json.loads(text, parse_constant=_reject_constant)
     except OSError as error:
         raise RegionError(f"{path}: cannot be read ({error.strerror})") from None

@@ -75,7 +75,7 @@ def write_json(path: Path, value: Any) -> None:
     """Write ``value`` as canonical JSON, whole or not at all; `StoreError` where it is too large to be read again."""
     text = to_json(value)
     if len(text) > MOST_BYTES // 4 and len(text.encode()) > MOST_BYTES:
-        raise StoreError(f"{path}: would be more than {MOST_BYTES >> 20} MB, which no command reads again")
+        raise StoreError(f"{path}: would be more than {MOST_BYTES >> 20} MB, the most that tcpipe reads")
     write_text(path, text)
 
 
@@ -94,7 +94,7 @@ def read_document(path: Path) -> bytes:
     except OSError as error:
         raise StoreError(f"{path}: cannot be read ({error.strerror}); run the command again that writes it") from None
     if len(data) > MOST_BYTES:
-        raise StoreError(f"{path}: is larger than {MOST_BYTES >> 20} MB, which no such file is; remove it")
+        raise StoreError(f"{path}: is larger than {MOST_BYTES >> 20} MB, the most that tcpipe writes; remove it")
     return data
 
 
@@ -125,7 +125,9 @@ def parse_typed(value: object, cls: type[T], path: Location) -> T:
         with _CONVERTING:
             return msgspec.convert(value, cls, str_keys=True, dec_hook=_from_text)
     except msgspec.ValidationError as error:
-        raise StoreError(f"{path}: is not what this version writes: {_format_validation_error(str(error))}") from None
+        raise StoreError(
+            f"{path}: does not have the format of this version: {_format_validation_error(str(error))}"
+        ) from None
 
 
 def parse_typed_json(text: str | bytes | memoryview, cls: type[T], path: Location) -> T:
@@ -136,7 +138,9 @@ def parse_typed_json(text: str | bytes | memoryview, cls: type[T], path: Locatio
     except msgspec.DecodeError as error:
         if "surrogate" in str(error):  # the name of a file is no text: only the standard library reads it
             return parse_typed(json.loads(text if isinstance(text, str) else bytes(text)), cls, path)
-        raise StoreError(f"{path}: is not what this version writes: {_format_validation_error(str(error))}") from None
+        raise StoreError(
+            f"{path}: does not have the format of this version: {_format_validation_error(str(error))}"
+        ) from None
 
 
 def _format_validation_error(message: str) -> str:

@@ -231,7 +231,9 @@ def _lay_out_stand_ins(
                 target.truncate(stored.size_bytes)
             os.utime(path, ns=(stored.modified_ns, stored.modified_ns))
     except OSError as error:
-        raise LogError(f"{url}: it cannot be laid out ({describe_full_disk(error) or error.strerror})") from error
+        raise LogError(
+            f"{url}: its local copy cannot be created ({describe_full_disk(error) or error.strerror})"
+        ) from error
     return laid
 
 
@@ -382,7 +384,7 @@ def read_aws_profile(environment: Mapping[str, str] = os.environ) -> dict[str, s
     keys = {key: found[entry] for entry, key in _PROFILE_KEYS.items() if entry in found}
     if wanted and not {"access_key_id", "secret_access_key"} <= keys.keys():
         export = f'eval "$(aws configure export-credentials --profile {name} --format env)"'
-        raise ValueError(f"the profile {name} holds no keys; run: {export}")
+        raise ValueError(f"the profile {name} contains no keys; run: {export}")
     return locations | keys
 
 
@@ -403,7 +405,7 @@ def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], 
     del settings
     scheme, _, bucket = container.partition("://")
     if not bucket:
-        raise ValueError(f"it names no bucket; expected {scheme}://bucket/name")
+        raise ValueError(f"it contains no bucket; expected {scheme}://bucket/name")
     for name in _ENDPOINT_VARIABLES:
         value = os.environ.get(name) or os.environ.get(name.lower())
         if scheme == "s3" and value and not _ENDPOINT.fullmatch(value):

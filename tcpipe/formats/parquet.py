@@ -129,7 +129,7 @@ def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None)
         size += least if name in at_most else longest
         at_most[name] = at_most.get(name, 0) + longest
     if size > most:
-        raise ValueError(f"it unfolds to {size / 1e6:.0f} MB, at most {most / 1e6:.0f}")
+        raise ValueError(f"it expands to {size / 1e6:.0f} MB, at most {most / 1e6:.0f}")
     texts = [
         field.name for field in schema if pa.types.is_string(field.type) and at_most[field.name] > MOST_BYTES // 16
     ]
@@ -143,7 +143,7 @@ def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None)
                 for chunk in table.column(at).chunks
             )
             if size > most:
-                raise ValueError(f"its texts unfold to more than {most / 1e6:.0f} MB")
+                raise ValueError(f"its texts expand to more than {most / 1e6:.0f} MB")
             plain = schema.field(field.name)
             table = table.set_column(at, plain, table.column(at).cast(plain.type))
     return table

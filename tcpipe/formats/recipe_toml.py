@@ -41,7 +41,7 @@ def load_recipe(path: Path | None) -> Recipe:
         with path.open("rb") as stream:
             data = stream.read(_MOST_BYTES + 1)
         if len(data) > _MOST_BYTES:
-            raise RecipeError(f"{path}: is larger than {_MOST_BYTES / 1e6:g} MB, which no recipe is")
+            raise RecipeError(f"{path}: is larger than {_MOST_BYTES / 1e6:g} MB, the most that tcpipe reads")
         return parse_recipe(parse_toml(data.decode("utf-8")), where=str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path}: the recipe cannot be read ({getattr(error, 'strerror', None) or error})") from None

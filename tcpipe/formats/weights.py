@@ -41,7 +41,7 @@ def read_arrays(path: Path) -> dict[str, GenericArray]:
         zipfile.BadZipFile,
         zlib.error,
     ) as error:
-        raise ModelError(f"{path}: cut short or damaged ({error})") from None
+        raise ModelError(f"{path}: truncated or damaged ({error})") from None
 
 
 def _require_plain_arrays(path: Path) -> None:

@@ -243,7 +243,7 @@ class ShardedArray:
             start, length = table[..., 0], table[..., 1]
             lies_within = (start <= offset) & (length >= _CRC_BYTES) & (length <= offset - np.minimum(start, offset))
             if not (lies_within | (start == _ABSENT)).all():
-                raise ValueError("its index names bytes beyond it")
+                raise ValueError("its index points outside the file")
             self._indices[shard] = table
         return self._indices[shard]
 
@@ -252,7 +252,7 @@ class ShardedArray:
         found = (self.fetched or _LocalShards).read(path, offset, size)
         content = found[:-_CRC_BYTES]
         if _compute_crc(content) != found[-_CRC_BYTES:]:
-            raise ValueError("its checksum does not agree")
+            raise ValueError("its checksum does not match")
         return content
 
     def _index_span(self, shard_bytes: int) -> tuple[int, int]:
@@ -309,7 +309,7 @@ def _decode(codec: Any, data: bytes, out: AnyArray) -> None:
 def _read_zstd_size(data: bytes) -> int:
     """Return how many bytes a frame says that it holds (RFC 8878, 3.1.1); 0 where it does not say."""
     if len(data) < 5:
-        raise ValueError("it is cut short")
+        raise ValueError("it is truncated")
     flag, is_single, has_dictionary = data[4] >> 6, data[4] >> 5 & 1, data[4] & 3
     start = 5 + (1 - is_single) + (0, 1, 2, 4)[has_dictionary]
     width = (is_single, 2, 4, 8)[flag]

@@ -55,7 +55,7 @@ class EvaluationResult:
                     (quantity, part.errors[quantity][ALL]) for quantity in QUANTITIES if quantity in part.errors
                 )
             )
-            lines.append(f"{split}: {part.samples} samples, MAPE (of so many labels) {', '.join(figures)}")
+            lines.append(f"{split}: {part.samples} samples, MAPE (number of labels) {', '.join(figures)}")
             lines += [
                 f"{split}: 90 % intervals of {name} cover {coverage}"
                 for name, coverage in part.coverage.items()

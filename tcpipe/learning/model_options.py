@@ -25,7 +25,7 @@ class TrainOptions:
     _: KW_ONLY
     model: Literal["auto", "linear", "physics", "boosting", "resnet18"] | None = option(
         None,
-        "Curves of class and slope, physics, a curve and boosted trees on what it leaves, or the paper's network. "
+        "Curves of class and slope, physics, boosted trees on the residuals of a curve, or the paper's network. "
         "auto: the simplest that predicts other runs as well as the best (default; "
         "with an option of the network, resnet18).",
         kind=("auto", "linear", "physics", "boosting", "resnet18"),
@@ -55,12 +55,12 @@ class TrainOptions:
     )
     extra_features: bool = option(
         False,
-        "Give the model the turn and the commanded speed of each segment besides its patch; the paper does not.",
+        "Give the model the turn and the commanded speed of each segment in addition to its patch; the paper does not.",
         ("--extra-features",),
     )
     layers: str | Sequence[str] | None = option(
         None,
-        "Layers of the patch, with commas between them, own ones by their names; "
+        "Layers of the patch, separated by commas, your own by name; "
         "NAME_one_hot has a channel for each class "
         "(default: ortho, terrain and height, as far as the dataset has them).",
         metavar="NAME,NAME,…",

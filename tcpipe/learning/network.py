@@ -188,7 +188,7 @@ class Trainer:
         except Exception as error:  # noqa: BLE001  those of torch, pickle and zipfile have no common base
             reason = str(error).partition("\n")[0]
             raise ModelError(
-                f"{path}: cut short or damaged ({reason}); remove it, or start again with --no-resume"
+                f"{path}: truncated or damaged ({reason}); remove it, or start again with --no-resume"
             ) from None
         return state
 

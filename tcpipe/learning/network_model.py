@@ -142,7 +142,7 @@ class NetworkModel(Predictor):
         trainer, device = _make_trainer(fit)
         model, times = cls(trainer.network, samples.inputs), TrainingTimes()
         state = _State(trainer, TrainingProgress(), trainer.copy_weights())
-        logger.info("%s: %d samples to fit, %d to stop by, on %s", job.name, len(fit), len(held), device)
+        logger.info("%s: %d samples to fit, %d for early stopping, on %s", job.name, len(fit), len(held), device)
         if job.checkpoint.exists():
             state.read(job.checkpoint)
             logger.info("%s: resumes after epoch %d", job.name, state.progress.epoch)

@@ -191,7 +191,7 @@ def read_curves(arrays: NamedArrays) -> tuple[Curves, dict[str, AnyArray]]:
     is_plausible = curves.knots_rad.size <= _MOST_KNOTS and len(curves.class_id) <= _MOST_CLASSES
     finite = all(np.isfinite(values).all() for values in (curves.knots_rad, curves.pooled, curves.own))
     if len(curves.pooled) != functions or not finite or not is_plausible:
-        raise ModelError("contains curves that no training makes; train the model again")
+        raise ModelError("contains curves that training cannot produce; train the model again")
     return curves, rest
 
 

@@ -285,7 +285,7 @@ def ask_predictor(
     wrong |= ~np.isclose(covariance, transposed, rtol=1e-4, atol=0.0).all(axis=(1, 2))
     if wrong.any():
         raise ModelError(
-            f"{who} returned {int(wrong.sum())} of {len(mean)} covariances that are none: "
+            f"{who} returned {int(wrong.sum())} of {len(mean)} covariances that are invalid: "
             "expected finite symmetric matrices "
             "without negative eigenvalues"
         )

@@ -143,7 +143,7 @@ def clean_trees(text: str, features: int) -> str:
     body = text[text.find("Tree=") : text.rfind(_END)]
     found, parts = list(_TREE.finditer(body)), list[str]()
     if not found or sum(len(match[0]) for match in found) != len(body):
-        raise ModelError("contains trees that no training makes; train the model again")
+        raise ModelError("contains trees that training cannot produce; train the model again")
     for number, match in enumerate(found):
         leaves, (split, threshold, decision, left, right, value) = int(match[1]), match.groups()[1:]
         try:

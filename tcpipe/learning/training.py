@@ -175,7 +175,9 @@ def train(
     name = choose_kind(data, rules) if rules.model == "auto" else rules.model
     kind = find_kind(name) if own is None else own.kind
     if kind.channels and rules.layers and rules.model != "auto":
-        raise UsageError(f"--layers: a model of kind {name} takes the slope and class of a metre, no patch; remove it")
+        raise UsageError(
+            f"--layers: a model of kind {name} uses the slope and class of a segment, not a patch; remove it"
+        )
     if kind.channels:
         level = logging.WARNING if rules.layers else logging.INFO
         logger.log(level, "%s: a model of kind %s takes the slope and class of each metre, and no layer", dataset, name)

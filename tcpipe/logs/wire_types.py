@@ -148,12 +148,12 @@ def _parse_field_type(found: re.Match[str], owner: str) -> FieldType:
         name = _KNOWN_AS.get(name, name)
         name = f"{owner.rsplit('/', 1)[0]}/{name}" if "/" not in name else normalize_type_name(name)
     if found["limit"] and name not in ("string", "wstring"):
-        raise MsgTextError(f"{owner}: only texts are bounded, not {name}")
+        raise MsgTextError(f"{owner}: only strings have a length bound, not {name}")
     limit = int(found["limit"] or 0)
     if not found["array"]:
         return FieldType(name, limit)
     if found["most"] and not found["size"]:
-        raise MsgTextError(f"{owner}: {found['name']} is bounded by nothing")
+        raise MsgTextError(f"{owner}: {found['name']} has an empty length bound")
     fixed = bool(found["size"]) and not found["most"]
     return FieldType(name, limit, int(found["size"] or 0), fixed)
 

@@ -154,7 +154,7 @@ def compare_fixes(
     second = (fixes.stamp_ns - start_ns) // 1_000_000_000
     kept = inside[np.unique([number[inside], second[inside]], axis=1, return_index=True)[1]]
     if not kept.size:
-        raise FusionError("no fix lies on the track of the rest")
+        raise FusionError("no fix is on the track of the other sensors")
     stamp_ns = fixes.stamp_ns[kept]
     rpy = [rows.interpolate(f"{name}_rad", stamp_ns) for name in ("roll", "pitch", "yaw")]
     rotation = matrix_from_quat(quat_from_rpy(*rpy))[:, :2]
@@ -218,10 +218,10 @@ def _compare_fixes(track: Track, section: Section, gnss: Positions, windows_ns: 
     rows = _select_rows(track, section)
     moving = np.array([rows.measure_length_m(*window) >= LEAST_WINDOW_M for window in windows_ns])
     if not moving.any():
-        raise FusionError("the rest has no track in the windows, or the robot is stationary there")
+        raise FusionError("the other sensors have no track in the windows, or the robot is stationary there")
     datum = track.info.datum
     if datum is None or section.datum_deg_m is None:
-        raise FusionError("the track of the rest has only local coordinates")
+        raise FusionError("the track of the other sensors has only local coordinates")
     places = geodetic_from_enu(gnss.position_enu_m, datum_deg_m=section.datum_deg_m)
     moved = enu_from_geodetic(*places, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m))
     arm_std_m = np.zeros(3)

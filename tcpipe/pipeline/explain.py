@@ -128,7 +128,7 @@ def explain(sample_id: str, *, dataset: Location = "dataset", store: Location = 
     card = read_intact_card(directory)
     if card.without_coordinates:
         raise DatasetError(
-            f"{directory}: is without coordinates, so that its samples have no known source; explain the dataset with them"
+            f"{directory}: has no coordinates, so the source of its samples is unknown; explain the dataset with coordinates"
         )
     sample = _read_sample(directory, sample_id)
     run = _find_run(opened, directory, card, sample)

@@ -170,7 +170,7 @@ def find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
         if tables and path.is_dir():
             files = ", ".join(mapping.file for mapping in tables.values())
             raise LogError(
-                *error.problems, f"{path}: nor is one of the files that the recipe's tables name: {files}"
+                *error.problems, f"{path}: it contains none of the files that the recipe's tables name: {files}"
             ) from None
         if path.is_dir() and (held := list_table_files(path)):
             init = f"tcpipe init --from {shlex.quote(str(path))}"

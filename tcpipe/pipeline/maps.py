@@ -198,7 +198,7 @@ def _find_unchanged(store: Store, state: State, name: str, inputs: MapInputs) ->
             changes.append(f"--{option.replace('_', '-')} is {now}, was {then}")
     if changes:
         raise MapError(
-            f"map {name}: is in the store already, made from something else: {'; '.join(changes)}; "
+            f"map {name}: is already in the store, made from other inputs: {'; '.join(changes)}; "
             "replace it with --force, or choose another name"
         )
     return _make_added(store, state.maps[name], "unchanged")

@@ -170,7 +170,7 @@ class BuildDatasetOptions:
     )
     labels: str | Sequence[str] = option(
         (),
-        "Labels that every sample needs, with commas: energy, time, slip, vibration (default: energy if a run has power, else time).",
+        "Labels that every sample needs, comma-separated: energy, time, slip, vibration (default: energy if a run has power, else time).",
         metavar="LIST",
     )
     without_patches: bool = option(

@@ -251,7 +251,7 @@ def predict_patches(model: Model, patches: Patches, asked: Mask, turn_radpm: Flo
         said = model.ask(form.form(pixels, rows), extra_features.take(rows))
         if said.mean.shape[1] != 2:
             raise ModelError(
-                f"{model.name}: gives {said.mean.shape[1]} numbers a patch, expected two: power and velocity; "
+                f"{model.name}: gives {said.mean.shape[1]} numbers per patch, expected two: power and velocity; "
                 "train it on both labels"
             )
         out.mean[rows], out.covariance[rows] = said.mean, said.covariance

@@ -308,7 +308,7 @@ def evaluate_drives(
     if compute_dataset_checksum(data.card) != trained.sha256:
         raise ModelError(
             f"{model.name}: was trained on another dataset ({trained.name}, {trained.sha256[:12]}) than {data.path}; "
-            "expected that one, to find out whether a drive was held back"
+            "expected that one, to find out whether a drive was used for training"
         )
     opened = open_store(store)
     runs = [find_drive(opened, log) for log in logs]

@@ -138,7 +138,7 @@ def _cut_into_segments(
     segments = cut_path(xy_m, chord_m=chord_m, scale=scale)
     if not segments.chord_m.size or segments.chord_m[0] < (shortest_m or chord_m) * (1.0 - 1e-6):
         raise PathError(
-            f"{where}: is {length_m * scale:.2f} m long and never {chord_m:g} m from where it starts; "
+            f"{where}: is {length_m * scale:.2f} m long and never {chord_m:g} m from its start; "
             f"expected a path of at least {chord_m:g} m"
         )
     return segments
@@ -169,7 +169,7 @@ def _sum_costs(  # noqa: PLR0917
     }
     located = _locate_segments(source, segments)
     if known is not None and errors is None:
-        raise ModelError(f"{model.name}: states no errors, which an adaptation weighs; train it on more samples")
+        raise ModelError(f"{model.name}: has no error estimates, which adaptation needs; train it on more samples")
     if errors is not None:
         begin_m, rise_m = np.cumsum(segments.arc_m), segments.arc_m * np.tan(said.slope_rad)
         for name, predicted in [(name, found[name]) for name in found if name in errors]:

@@ -37,7 +37,7 @@ class PredictPathOptions:
     predictor: str | None = option(None, PREDICTOR)
     adapt: Location | None = option(
         None,
-        "Adapt MODEL by the labelled metres of a run, of this or another robot: "
+        "Adapt MODEL to the labelled segments of a run, of this or another robot: "
         "an ingested log, by its path or its run's name.",
         metavar="RUN",
     )
@@ -68,7 +68,7 @@ class PlanPathOptions:
     allow_extrapolation: bool = option(False, "Also cross ground outside the training range of the model.")
     risk: float | None = option(
         None,
-        "Minimise what the path does not exceed with this probability (default with --budget: 0.95).",
+        "Minimise the cost that the path stays below with this probability (default with --budget: 0.95).",
         (),
         Range(0.5, 0.999),
         "PROBABILITY",
@@ -106,7 +106,7 @@ class RouteGraphOptions:
     _: KW_ONLY
     out: str = option("route-graph.geojson", "Write the graph.", (), "output_file", "FILE")
     origin: tuple[float, float] | None = option(None, _ORIGIN)
-    two_way: bool = option(False, "Add an edge back for each that has none.")
+    two_way: bool = option(False, "Add the reverse edge of each edge that has none.")
     map: str | None = option(None, MAP)
     speed: float | None = option(None, SPEED)
     predictor: str | None = option(None, PREDICTOR)

@@ -110,7 +110,7 @@ def test_the_store_is_named_in_the_same_way_everywhere(place: Path) -> None:
         assert len(outputs) == 1 or command[0] == "report", command
         assert {by_option.returncode, by_variable.returncode, as_before.returncode} == {0}, by_option.stderr
     twice = tcpipe("verify", "store", "--store", "store", cwd=place)
-    said = "tcpipe: store: is a path, and --store is where a run is looked up; give one of them\n"
+    said = "tcpipe: store: is a path, and --store is only for names of runs; remove one of them\n"
     assert (twice.returncode, twice.stderr) == (2, said)
     nowhere = tcpipe("verify", cwd=place)
     assert (nowhere.returncode, nowhere.stdout) == (2, "")

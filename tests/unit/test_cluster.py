@@ -88,7 +88,7 @@ def test_a_scheduler_without_workers_and_a_worker_of_many_threads_are_one_line(t
             ):
                 list(run_all(where, [1], jobs=1, cluster=lonely.address))
         lonely.start_worker(threads=2)
-        with pytest.raises(UsageError, match="has 2 threads; expected one a worker"):
+        with pytest.raises(UsageError, match="has 2 threads; expected one thread per worker"):
             list(run_all(where, [1], jobs=1, cluster=lonely.address))
 
 

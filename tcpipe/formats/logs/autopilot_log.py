@@ -121,7 +121,7 @@ class AutopilotRecords:
             self.add_damage("messages-not-decoded", f"/{name}", 0, reason=f"{name} has no time")
             return
         if len(self.messages) >= MAX_TOPICS:
-            raise LogError(f"{self.path}: it contains more than {MAX_TOPICS} topics; no such log is read")
+            raise LogError(f"{self.path}: it contains more than {MAX_TOPICS} topics; tcpipe does not read such a log")
         stamps = _gather_field(self.data, offsets, layout, clock) * _CLOCKS[clock]
         self.messages[f"{name}_{instance}" if instance else name] = AutopilotMessages(
             name, layout, offsets, stamps, scales
@@ -289,7 +289,7 @@ class _UlogReader:
         if name not in self._layouts:
             self._layouts[name] = self._make_layout(name)
             if self._columns > MAX_COLUMNS:
-                raise LogError(f"{self._records.path}: its topics unfold to more than {MAX_COLUMNS} columns")
+                raise LogError(f"{self._records.path}: its topics expand to more than {MAX_COLUMNS} columns")
         layout = self._layouts[name]
         self._by_id.pop(number, None)
         if isinstance(layout, str):

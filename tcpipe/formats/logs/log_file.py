@@ -406,7 +406,7 @@ class Log(OpenLog):
             columns += found.wire.leaves
             if columns > MAX_COLUMNS:
                 raise LogError(
-                    f"{self.path}: its topics unfold to more than {MAX_COLUMNS} columns; read fewer of them at once"
+                    f"{self.path}: its topics expand to more than {MAX_COLUMNS} columns; read fewer of them at once"
                 )
         return {name: TopicTable(message_type, self.topics[name].encoding) for name, message_type in types.items()}
 
@@ -480,7 +480,9 @@ class Log(OpenLog):
             if channel is first:
                 topics[channel.name] = topic
                 if len(topics) > MAX_TOPICS:
-                    raise LogError(f"{self.path}: it contains more than {MAX_TOPICS} topics; no such log is read")
+                    raise LogError(
+                        f"{self.path}: it contains more than {MAX_TOPICS} topics; tcpipe does not read such a log"
+                    )
             elif (channel.type_name, channel.encoding) == (first.type_name, first.encoding):
                 topics[channel.name] = topics[channel.name].joined(topic)
         return topics

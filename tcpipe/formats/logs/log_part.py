@@ -301,7 +301,7 @@ class Bounds:
                 raise self._bomb(f"it contains more than {most} {what}")
 
     def _bomb(self, why: str) -> LogError:
-        return LogError(f"{self._path}: {why}; it is taken for a bomb, not a log")
+        return LogError(f"{self._path}: {why}; tcpipe rejects it as a decompression bomb")
 
 
 def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:

@@ -137,7 +137,7 @@ class TypeLibrary:
         definitions: _Definitions = {}
         wire = _Unfold(known, fallback, definitions).record(type_name, ())
         if wire.leaves > MAX_COLUMNS:
-            raise DefinitionError(f"type {type_name} unfolds to {wire.leaves} columns, more than {MAX_COLUMNS}")
+            raise DefinitionError(f"type {type_name} expands to {wire.leaves} columns, more than {MAX_COLUMNS}")
         return MessageType(wire, source, definitions)
 
     def _known(self, type_name: str, definition: str, schema_encoding: str) -> tuple[_Definitions, Source]:

@@ -141,7 +141,9 @@ def decompress_file(path: Path, directory: Path) -> Path:
                 target.write(block)
                 written += len(block)
                 if is_bomb(size, written):
-                    raise LogError(f"{path}: {size} bytes hold more than {written}; it is taken for a bomb, not a log")
+                    raise LogError(
+                        f"{path}: {size} bytes hold more than {written}; tcpipe rejects it as a decompression bomb"
+                    )
     except OSError as error:
         raise LogError(
             f"{path}: it cannot be decompressed into a copy ({describe_full_disk(error) or error.strerror})"

@@ -63,12 +63,12 @@ class SqlitePart(LogPart):
             self.close()
             why = describe_full_disk(error) or error.strerror
             raise LogError(
-                f"{path}: it cannot be read, or copied to be read ({why}); nothing can be had from it"
+                f"{path}: it cannot be read, or copied to be read ({why}); tcpipe reads nothing of it"
             ) from None
         except _BROKEN as error:
             self.close()
             raise LogError(
-                f"{path}: its table of topics cannot be read ({_describe_error(error)}); nothing can be had from it"
+                f"{path}: its table of topics cannot be read ({_describe_error(error)}); tcpipe reads nothing of it"
             ) from None
 
     def close(self) -> None:
@@ -127,7 +127,7 @@ class SqlitePart(LogPart):
         for name, kind, root in self._database.execute(query, _TABLES):
             computed = any(hidden for *_, hidden in self._database.execute(f"PRAGMA table_xinfo({name})"))
             if kind != "table" or not root or computed:
-                raise LogError(f"{path}: its {name!r} is no plain table; nothing can be had from it")
+                raise LogError(f"{path}: its {name!r} is no plain table; tcpipe reads nothing of it")
 
     def _channels(self, path: Path) -> dict[int, Topic]:
         rows = self._database.execute(

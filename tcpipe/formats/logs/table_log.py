@@ -145,8 +145,8 @@ def _find_clock_mismatch(read: Iterable[TopicMessages]) -> Iterator[str]:
             apart_s = (start_ns - first_ns) / 1e9
             yield (
                 f"{name} and {longest} have no time in common (they begin {abs(apart_s):.3f} s apart): two clocks, or two drives; "
-                f"offset_s under its table is added to its stamps; 'tcpipe init --from' finds it by speed and turns "
-                f"({apart_s:.3f} lets both begin together)"
+                f"add offset_s under its table to shift its stamps; 'tcpipe init --from' finds it by speed and turns "
+                f"({apart_s:.3f} makes both begin at the same time)"
             )
 
 

@@ -148,7 +148,7 @@ def _check_lengths(topic: str, columns: NamedArrays) -> None:
     for name, values in columns.items():
         ragged = values.dtype.kind == "S" and (np.char.str_len(values) != values.dtype.itemsize).any()
         if ragged or values.dtype.kind not in "biufS":
-            raise UsageError(f"{topic}: column {name} ({values.dtype}) wants numbers, or bytes of one length")
+            raise UsageError(f"{topic}: column {name} ({values.dtype}) expected numbers, or bytes of one length")
 
 
 def _place(message: Any, name: str, dtype: np.dtype[Any], serialize: Callable[[], Bytes]) -> int:

@@ -192,7 +192,7 @@ def _read_whole_numbers(tile: Tile, values: AnyArray, valid: Mask) -> AnyArray:
     if odd.size:
         raise MapError(
             f"{tile.path}: {tile.role} has the value {odd[0]:g}, expected whole numbers; if classes were interpolated, transform the "
-            "raster of before that: rio warp in.tif out.tif --like height.tif --resampling nearest"
+            "original raster: rio warp in.tif out.tif --like height.tif --resampling nearest"
         )
     return whole.astype(tile.dtype)
 
@@ -308,7 +308,7 @@ def check_layout(dataset: Any, where: str, remedy: str) -> None:
     block *= dataset.count if dataset.profile.get("interleave") == "pixel" else 1
     if block > _MAX_BLOCK_BYTES:
         raise MapError(
-            f"{where}: kept in blocks of {block / 1e6:.0f} MB, at most {_MAX_BLOCK_BYTES // 10**6}; "
+            f"{where}: stored in blocks of {block / 1e6:.0f} MB, at most {_MAX_BLOCK_BYTES // 10**6}; "
             f"{remedy} --co tiled=true --co blockxsize=256 --co blockysize=256 --co bigtiff=if_safer"
         )
 
@@ -356,10 +356,10 @@ def describe_raster_error(error: BaseException) -> str:
 
 def _refuse_unplaced(dataset: Any, path: Path) -> None:
     if dataset.count == 0:
-        raise MapError(f"{path}: the file contains no bands itself; name one of its subdatasets as a GeoTIFF")
+        raise MapError(f"{path}: the file contains no bands itself; export one of its subdatasets as a GeoTIFF")
     if dataset.crs is None and dataset.gcps[0]:
         raise MapError(
-            f"{path}: placed by {len(dataset.gcps[0])} ground control points only; rectify it: rio warp in.tif out.tif --dst-crs EPSG:n"
+            f"{path}: placed only by {len(dataset.gcps[0])} ground control points; rectify it: rio warp in.tif out.tif --dst-crs EPSG:n"
         )
     if dataset.transform.is_identity:
         raise MapError(

@@ -165,7 +165,7 @@ def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, fl
     if odd:
         got, wanted = (f"{abs(tile.affine[0]):.6g} x {abs(tile.affine[4]):.6g}" for tile in (odd[0], tiles[base]))
         raise MapError(
-            f"{tiles[0].role}: {len(odd)} of {len(tiles)} files do not lie on the pixels of the rest "
+            f"{tiles[0].role}: {len(odd)} of {len(tiles)} files are not aligned with the pixels of the others "
             f"({got}, the rest {wanted}): {', '.join(shorten_problems([str(tile.path) for tile in odd]))}; "
             f"put all on one grid: rio merge --resampling {'nearest' if tiles[0].use == 'classes' else 'bilinear'} "
             f"--nodata {-9999 if tiles[0].use == 'metres' else 0} *.tif joined.tif"

@@ -210,7 +210,7 @@ def _refuse_sizes(kept: _Attributes, path: Path) -> None:
     rows, cols, pixel_size_m = kept.grid.rows, kept.grid.cols, kept.grid.pixel_size_m
     if not (0 < rows <= MAX_SIDE_PX and 0 < cols <= MAX_SIDE_PX and rows * cols <= MAX_PIXELS and pixel_size_m > 0):
         raise StoreError(
-            f"{path}: says that it has {rows} x {cols} pixels of {pixel_size_m} m, at most {MAX_SIDE_PX} a side"
+            f"{path}: claims to have {rows} x {cols} pixels of {pixel_size_m} m, at most {MAX_SIDE_PX} a side"
         )
     wanted = (TILE_PX, list_factors(kept.grid))
     if (kept.tile_px, kept.factors) != wanted:
@@ -254,7 +254,7 @@ def _prove(path: Path, fetched: FetchedShards | None) -> None:
     lost = [str(path / name) for name, entry in listed.items() if not _has_size(path / name, entry.size_bytes, size_of)]
     if lost:
         more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
-        raise MapError(f"{lost[0]}{more}: gone or cut short; add the map again")
+        raise MapError(f"{lost[0]}{more}: missing or truncated; add the map again")
 
 
 def _has_size(path: Path, size_bytes: int, size_of: Callable[[Path], int]) -> bool:

@@ -142,7 +142,7 @@ def make_publication(content: Content, inputs: ChosenInputs, *, patch_m: float) 
     """Return the origins, by the samples of a dataset, and its public names."""
     if content.plane == LOCAL:
         raise DatasetError(
-            "--without-coordinates: the runs have no GNSS, so that nothing states their place on Earth; remove the option"
+            "--without-coordinates: the runs have no GNSS, so their positions on Earth are unknown; remove the option"
         )
     low_m, height_m, start_ns = np.full(2, np.inf), math.inf, np.iinfo(np.int64).max
     datum, plane_chord, chord_chord = (0.0, 0.0, 0.0), 0.0, 0.0

@@ -66,9 +66,7 @@ def test_a_profile_that_cannot_be_used_is_one_line(
     monkeypatch.delenv("AWS_SKIP_SIGNATURE")
     open_place(f"s3://{READ_ONLY}").check()
     monkeypatch.setenv("AWS_PROFILE", "sso")
-    exported = (
-        r'the profile sso holds no keys; run: eval "\$\(aws configure export-credentials --profile sso --format env\)"'
-    )
+    exported = r'the profile sso contains no keys; run: eval "\$\(aws configure export-credentials --profile sso --format env\)"'
     with pytest.raises(StoreError, match=exported):
         open_place(f"s3://{READ_ONLY}").check()
     (tmp_path / ".aws" / "config").write_text("region = x")

@@ -1,4 +1,4 @@
-"""Parquet that unfolds out of all proportion is refused by the headers of its pages, in a process that may take little memory."""
+"""Parquet that expands out of all proportion is refused by the headers of its pages, in a process that may take little memory."""
 
 import resource
 import subprocess
@@ -63,9 +63,9 @@ def test_small_files_that_become_large_are_refused_before_they_do(tmp_path):
     for path, line in zip(paths, lines, strict=True):
         assert line.startswith("StoreError"), line
         assert path.name in line
-        assert "unfold" in line
+        assert "expand" in line
         if pq.read_metadata(path).num_row_groups == 1:
-            with pytest.raises(StoreError, match="unfold"):
+            with pytest.raises(StoreError, match="expand"):
                 read_table(path, group=0)
 
 

@@ -110,7 +110,7 @@ def test_the_property_split_rules(tmp_path):
         (polygon([{"a": 1}, {"a": 1}]), "type must be array"),
         ({"type": "GeometryCollection", "coordinates": [1]}, "key 'geometries' not found"),
         ({"type": "x" * 10**6}, "xxx…, expected"),
-        ("[" * (MAX_VALUES + 1), "1500001 positions, rings and objects, at most 1500000; simplify it"),
+        ("[" * (MAX_VALUES + 1), "1500001 positions, rings and objects, expected at most 1500000; simplify it"),
         ('{"type":' + "[" * 200_000, "not JSON"),
     ],
     ids=lambda of: str(of)[:20],
@@ -143,5 +143,5 @@ def test_a_missing_file_and_one_that_is_too_large_are_named(tmp_path):
         read_regions(path)
     with path.open("wb") as stream:
         stream.truncate(10**12)
-    with pytest.raises(RegionError, match="1000000 MB of GeoJSON, at most 50"):
+    with pytest.raises(RegionError, match="1000000 MB of GeoJSON, expected at most 50"):
         read_regions(path)

@@ -68,7 +68,7 @@ def test_what_does_not_fit_is_named_by_file_and_key(tmp_path, value, line):
     path.write_text(json.dumps(value))
     with pytest.raises(StoreError) as caught:
         read_as(path, Document)
-    assert str(caught.value).removesuffix(", got 1") == f"{path}: is not what this version writes: {line}"
+    assert str(caught.value).removesuffix(", got 1") == f"{path}: does not have the format of this version: {line}"
 
 
 def test_threads_that_meet_a_document_at_once_all_read_it():

@@ -169,7 +169,7 @@ def test_a_bucket_that_cannot_be_used_is_one_line(tmp_path: Path, monkeypatch: p
         keys.setenv("AWS_SECRET_ACCESS_KEY", "b")
         with pytest.raises(StoreError, match=r"rejects the credentials, or the clock of this machine is wrong"):
             open_place(f"s3://{SKEWED}/x").size("a")
-    with pytest.raises(StoreError, match=r"it names no bucket; expected s3://bucket/name"):
+    with pytest.raises(StoreError, match=r"it contains no bucket; expected s3://bucket/name"):
         open_place("s3:///x").check()
     with monkeypatch.context() as half:
         half.delenv("AWS_SKIP_SIGNATURE")

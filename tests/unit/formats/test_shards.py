@@ -137,10 +137,10 @@ def crc(data):
     [
         (10, (None, None), "it contains 10 bytes, expected 576"),
         (50_000_000, (None, None), "it contains 50000000 bytes, expected 576"),
-        (576, (2**63, 100), "its index names bytes beyond it"),
-        (576, (0, 2**62), "its index names bytes beyond it"),
-        (576, (0, 3), "its index names bytes beyond it"),
-        (576, (2**64 - 2, 2**63), "its index names bytes beyond it"),
+        (576, (2**63, 100), "its index points outside the file"),
+        (576, (0, 2**62), "its index points outside the file"),
+        (576, (0, 3), "its index points outside the file"),
+        (576, (2**64 - 2, 2**63), "its index points outside the file"),
     ],
 )
 def test_a_sealed_shard_that_claims_too_much_or_too_little_is_damage(tmp_path, codec, length, place, wanted):

@@ -49,7 +49,7 @@ def member(shape, values=b""):
 def test_a_header_that_claims_a_terabyte_is_damage(tmp_path, shape):
     with zipfile.ZipFile(tmp_path / "w.npz", "w") as archive:
         archive.writestr("a.npy", member(shape, bytes(48)))
-    with pytest.raises(ModelError, match=r"w\.npz: cut short or damaged"):
+    with pytest.raises(ModelError, match=r"w\.npz: truncated or damaged"):
         read_arrays(tmp_path / "w.npz")
 
 

@@ -74,7 +74,7 @@ def test_no_model_and_half_a_model(tmp_path, place):
         ({"kind": "tcpipe dataset"}, "not the card of a tcpipe model"),
         (
             {"inputs": None},
-            "model.json: is not what this version writes: inputs: expected an object, got null; remove the folder and",
+            "model.json: does not have the format of this version: inputs: expected an object, got null; remove the folder and",
         ),
     ],
 )

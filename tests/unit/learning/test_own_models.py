@@ -147,7 +147,7 @@ def test_covariances_of_an_own_model_reach_its_intervals(place, tmp_path):
         ("def predict(patches, features):\n    return features.gone", ModelError, r"no attribute 'gone' \(.*line 2, in predict"),
         ("def predict(p, f):\n    return p[:, 0, 0]", ModelError, r"mine.py: predict returned shape \(50, 3\), expected \(50, 2\)"),
         ("class A:\n    def predict(self, p, f): return p[:, 0, 0, :2], p[:, 0, 0]", ModelError, r"A.predict returned covariances of"),
-        ("def predict(p, f):\n    return p[:, 0, 0, :2], p[:, :2, :2, 0] * 0 - 1", ModelError, "50 of 50 covariances that are none"),
+        ("def predict(p, f):\n    return p[:, 0, 0, :2], p[:, :2, :2, 0] * 0 - 1", ModelError, "50 of 50 covariances that are invalid"),
         ("x = 1", UsageError, "has no a class with a method predict, or a function predict; expected one"),
         ("class A:\n    predict = 1\nclass B(A): pass", UsageError, r"has A, B; expected one: name it as .*mine.py:NAME"),
         ("def predict(patches, features):\n    return patches[:, 0, 0, :2] * float('nan')", ModelError, "no finite prediction of"),

@@ -86,8 +86,8 @@ def test_they_predict_as_lightgbm_and_are_its_own_text():
         ("leaf_value", "inf", "not finite"),
         ("leaf_value", "1 2", "invalid nodes"),
         ("num_leaves", "19", "invalid nodes"),
-        ("num_cat", "1", "no training makes"),
-        ("is_linear", "1", "no training makes"),
+        ("num_cat", "1", "training cannot produce"),
+        ("is_linear", "1", "training cannot produce"),
         ("split_feature", "99999999999999999999", "cannot be read"),
     ],
 )
@@ -99,7 +99,7 @@ def test_a_text_by_which_the_reader_would_leave_its_memory_is_refused(name, valu
     with pytest.raises(ModelError, match=words):
         forest.clean_trees(broken, 4)
     for part in ("", text[:300], text.replace("Tree=0", "Tree=0\nTree=0")):
-        with pytest.raises(ModelError, match="no training makes"):
+        with pytest.raises(ModelError, match="training cannot produce"):
             forest.clean_trees(part, 4)
 
 

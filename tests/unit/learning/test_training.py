@@ -154,7 +154,7 @@ def test_a_state_of_another_training_is_kept_and_one_cut_short_is_told(dataset, 
     assert checkpoint.read_bytes() == state
     checkpoint.write_bytes(state[:-1000])
     with pytest.raises(
-        ModelError, match=r"checkpoint: cut short or damaged .*; remove it, or start again with --no-"
+        ModelError, match=r"checkpoint: truncated or damaged .*; remove it, or start again with --no-"
     ) as told:
         train(dataset, place, config=config)
     assert len(told.value.problems) == 1

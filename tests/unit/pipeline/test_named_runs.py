@@ -65,6 +65,6 @@ def test_what_exists_is_a_path_and_has_no_store(store, tmp_path):
     (tmp_path / "a").mkdir()
     assert [is_path(name) for name in ("a", "b", "s3://bucket/a", "x" * 300)] == [True, False, True, False]
     found = CliRunner().invoke(cli, ["inspect", "a", "--store", "field"])
-    assert "a: is a path, and --store is where a run is looked up; give one of them" in str(found.exception)
+    assert "a: is a path, and --store is only for names of runs; remove one of them" in str(found.exception)
     assert "b: from /logs/b.mcap" in CliRunner().invoke(cli, ["inspect", "b", "--store", "field"]).output
     assert "field: 2 runs, maps: none" in CliRunner().invoke(cli, ["inspect"], env={"TCPIPE_STORE": "field"}).output

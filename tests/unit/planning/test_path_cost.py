@@ -146,14 +146,14 @@ def test_where_the_model_says_that_nothing_moves_there_is_no_cost():
 
 
 def test_a_model_of_something_else_is_refused():
-    with pytest.raises(ModelError, match="gives 1 numbers a patch, expected two"):
+    with pytest.raises(ModelError, match="gives 1 numbers per patch, expected two"):
         _cost(plane(), (4.0, 4.0), (9.0, 4.0), model=_EnergyAlone())
 
 
 def test_bad_paths_are_one_line_each():
     source = plane()
     for points, words in [
-        (((4.0, 4.0), (4.3, 4.0)), "never 1 m from where it starts"),
+        (((4.0, 4.0), (4.3, 4.0)), "never 1 m from its start"),
         (((4.0, 4.0), (4.0, 4.0)), "one point"),
         (((400.0, 4.0), (420.0, 4.0)), "is not on map"),
     ]:

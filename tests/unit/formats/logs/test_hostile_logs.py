@@ -183,7 +183,7 @@ MANY = [f"a{number}:uint64_t timestamp;" for number in range(11_000)]
 WIDE = "".join(f"int8 f{number}\n" for number in range(9000))
 COMPUTED = "id INTEGER PRIMARY KEY, topic_id, timestamp, data GENERATED ALWAYS AS (zeroblob(900000000))"
 TOPIC = "INSERT INTO topics VALUES (0, '/t', 'a/msg/A', 'cdr')"
-BOMB = "taken for a bomb"
+BOMB = "as a decompression bomb"
 SEPARATOR = "=" * 80 + "\n"
 LEVELS = "L0 part\n" + "".join(f"{SEPARATOR}MSG: acme_msgs/L{n}\nL{n + 1} part\n" for n in range(3000))
 CHUNK_HEAD = b"\x06" + struct.pack("<QQQQIIQ", 40, 0, 0, 1 << 61, 0, 0, 0) + b"\xff"

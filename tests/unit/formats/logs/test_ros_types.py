@@ -85,7 +85,7 @@ def test_a_definition_that_unfolds_without_bound_is_refused():
     parts = [f"MSG: a/L{level}\n" + "".join(f"a/L{level + 1} f{i}\n" for i in range(10)) for level in range(8)]
     parts.append("MSG: a/L8\nfloat64 x\n")
     text = "a/L0 root\n" + "".join(SEPARATOR + part for part in parts)
-    with pytest.raises(DefinitionError, match="unfolds to 100000000 columns"):
+    with pytest.raises(DefinitionError, match="expands to 100000000 columns"):
         resolve(text, name="a/msg/Top")
 
 

@@ -111,7 +111,7 @@ def test_a_folder_of_tables_is_ingested_as_one_log_and_what_is_in_the_way_is_sai
     wrong = Recipe(tables={"gnss": TableMapping("fixes.csv")})
     with pytest.raises(UsageError) as caught:
         ingest([folder], store=tmp_path / "store", recipe=wrong)
-    assert "nor is one of the files that the recipe's tables name: fixes.csv" in caught.value.problems[1]
+    assert "it contains none of the files that the recipe's tables name: fixes.csv" in caught.value.problems[1]
     recipe = Recipe(tables={"wheel_odometry": WHEELS, "imu": TableMapping("odom.csv")})
     (failed,) = ingest([tmp_path], store=tmp_path / "store", recipe=recipe).results
     assert (failed.status, failed.log) == ("failed", str(folder))

@@ -113,7 +113,7 @@ ODD = {
     "none.tif": (None, corner(STEP, 0), r"another CRS than the rest \(none"),
     "type.tif": ("EPSG:32633", corner(STEP, 0), r"int16 \(gray\), expected float32"),
     "pitch.tif": ("EPSG:32633", corner(0, 0, 0.5), "0.5 x 0.5, the rest 0.25 x 0.25.*rio merge --resampling bilinear"),
-    "shift.tif": ("EPSG:32633", corner(STEP + 0.4, 0), "do not lie on the pixels of the rest"),
+    "shift.tif": ("EPSG:32633", corner(STEP + 0.4, 0), "are not aligned with the pixels of the others"),
 }
 
 

@@ -156,5 +156,5 @@ def test_a_raster_in_one_huge_block_is_refused(tmp_path):
         tmp_path / "h.tif", "w", **profile, crs="EPSG:32633", transform=PLACE, sparse_ok=True, compress="deflate"
     ):
         pass
-    with pytest.raises(MapError, match="kept in blocks of 648 MB, at most 256"):
+    with pytest.raises(MapError, match="stored in blocks of 648 MB, at most 256"):
         read_tile(tmp_path / "h.tif", "height", "metres")
