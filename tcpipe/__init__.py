@@ -48,5 +48,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the public names; what is loaded besides is private."""
+    """List the public names; all other loaded names are private."""
     return __all__

@@ -1,6 +1,6 @@
 """`read_log`, and the commands `train`, `evaluate`, `predict-path` and `plan-path` as functions with keywords.
 
-A function imports what it needs when it is called: a model of physics needs no plots, and a path no evaluation.
+A function imports its dependencies when it is called, so a model of physics loads no plots, and a path no evaluation.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def read_log(path: Location, *, msgdef: Location | None = None) -> Log | TableLog:
-    """Open a log: ``topics``, ``table(topic)``, ``tables(topics)``, ``damage``; a damaged log gives what is intact.
+    """Open a log: ``topics``, ``table(topic)``, ``tables(topics)``, ``damage``; of a damaged log, the intact part.
 
     Raises `LogError`: the path is no log. ``msgdef`` is a directory of type definitions that the log lacks.
     """

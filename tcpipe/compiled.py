@@ -47,7 +47,7 @@ event.register("numba:compile", _Announce())
 
 
 def _raise_shape_error(source: _Shape, target: _Shape) -> None:  # noqa: ARG001  numba calls it with both shapes
-    """Raise what numba raises where an array does not fit into a slice, without its text of both shapes.
+    """Raise the error of numba for an array that does not fit into a slice, without its text of both shapes.
 
     To format this text, numba compiles text functions into each kernel that assigns an array: a fifth of the time that
     the filter takes to compile.

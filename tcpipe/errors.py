@@ -1,6 +1,6 @@
 """Every error a user can meet: subclasses of `TcpipeError`, exit code 1, or 2 of `UsageError` and `RecipeError`.
 
-Each carries one or more *problems*: plain lines that say what, where, got, expected and what to do.
+Each has one or more *problems*: lines that state what happened, where, got and expected values, and what to do.
 The command line prints them; a traceback is a bug.
 """
 
@@ -39,7 +39,7 @@ def split_secrets(scheme: str, rest: str) -> tuple[str, str]:
         rest = rest if is_port else rest.rpartition("@")[2]
     public = re.split(r"[?#]" if is_http else r"\?", rest, maxsplit=1)[0]
     query = rest[len(public) :]
-    return (public, query) if is_http or "=" in query else (rest, "")  # names of objects may hold question marks
+    return (public, query) if is_http or "=" in query else (rest, "")  # names of objects may contain question marks
 
 
 def clean_line(text: str) -> str:
@@ -57,12 +57,12 @@ def list_first(names: Sequence[str], most: int = 1) -> str:
 
 
 def clean_lines(lines: Iterable[str]) -> str:
-    """Return lines as one text, a `clean_line` each: no name in them makes a line of its own."""
+    """Join lines, each cleaned by `clean_line`, so that no name adds a line break."""
     return "\n".join(map(clean_line, lines))
 
 
 class TcpipeError(Exception):
-    """Base of everything tcpipe raises on purpose; ``problems`` holds one plain line each.
+    """Base class of all errors that tcpipe raises on purpose; ``problems`` has one line for each.
 
     ``findings`` are those that were made before (`tcpipe.tables.findings.Finding`), which the command line prints, too.
     """
@@ -80,7 +80,7 @@ class TcpipeError(Exception):
 
 
 class UsageError(TcpipeError):
-    """The call asks for something impossible: an option, a path where nothing or something else is."""
+    """The call is impossible: a wrong option, or a path that is missing or of another kind."""
 
     exit_code = 2
 
@@ -90,7 +90,7 @@ class RecipeError(UsageError):
 
 
 class LogError(TcpipeError):
-    """A file is not a log, or nothing in it can be used."""
+    """A file is not a log, or has no usable content."""
 
 
 class RoleError(LogError):
@@ -114,7 +114,7 @@ class StoreError(TcpipeError):
 
 
 class MissingFileError(StoreError):
-    """A file that the store should have is gone; ``where`` is its path or URL."""
+    """A file of the store is missing; ``where`` is its path or URL."""
 
     def __init__(self, where: str, findings: Iterable[Any] = ()) -> None:
         super().__init__(f"{where}: is missing", findings=findings)

@@ -39,7 +39,7 @@ Said: TypeAlias = tuple[Any, ...]
 """Arguments of `Logger.log`."""
 
 _LONGEST_SAYING_BYTES = 3000
-"""Less than what a pipe takes in one piece: nothing is cut or mixed, whoever dies."""
+"""Longest message [byte]: a pipe writes it in one piece, even if a process dies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Outcome(Generic[R]):
 
 
 def unwrap_result(outcome: Outcome[R | TcpipeError]) -> R:
-    """Return what a task gave that returns its error; raise that, or that its worker died."""
+    """Return the result of a task; raise the error that it returned, or that its worker died."""
     if isinstance(outcome.result, TcpipeError):
         raise outcome.result
     if outcome.died:
@@ -105,7 +105,7 @@ def refuse_import_of_script(jobs: int) -> None:
 
 
 class _WorkerContext(SpawnContext):
-    """Spawns workers that know by their name whose they are; `workers` are all of them."""
+    """Context that spawns workers named after this process; `workers` are all of them."""
 
     def __init__(self) -> None:
         self.workers = list[SpawnProcess]()
@@ -151,7 +151,7 @@ def _run_alone(function: Callable[[T], R], task: T, index: int) -> Outcome[R]:
 
 @contextmanager
 def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Yield worker processes that say here what they log and live no longer than this process wants them to."""
+    """Yield worker processes that send their log lines here and end with this block."""
     context = _WorkerContext()
     heard, saying = context.Pipe(duplex=False)
     life, alive = context.Pipe(duplex=False)
@@ -176,7 +176,7 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _repeat(heard: Connection) -> None:
-    """Log here what workers say, until the last of them is gone."""
+    """Log the messages of workers here, until the last worker ends."""
     with suppress(EOFError):
         while True:
             logger.log(*heard.recv())
@@ -225,12 +225,12 @@ _ALONE_S = 300
 """Longest time for which a cluster may have no workers [s]."""
 _ADDRESS = re.compile(r"(tcp|tls)://[^/@]+:\d+")
 _AHEAD = 2
-"""Tasks that a worker is handed at once: the next waits beside it."""
+"""Tasks that a worker gets at the same time: one runs, the next one waits."""
 
 
 @dataclass(slots=True)
 class _Workers:
-    """The workers of a Dask scheduler, its address, and how many tasks they are handed at once."""
+    """The workers of a Dask scheduler, its address, and the number of tasks in flight."""
 
     client: Client
     address: str
@@ -273,7 +273,7 @@ def _run_elsewhere(function: Callable[[T], R], todo: Iterator[tuple[int, T]], cl
                 for future in workers.wait_for_first(running):
                     yield _get_outcome(future, running.pop(future), cluster)
         finally:
-            for future in running:  # what has not begun does not begin any more
+            for future in running:  # cancel tasks that have not begun
                 future.cancel()
 
 
@@ -350,7 +350,7 @@ def _count_workers(client: Client, address: str) -> int:
     for worker, version in client.run(eval, "__import__('tcpipe').__version__", on_error="return").items():
         if isinstance(version, ImportError):
             raise UsageError(f"{worker}: a worker lacks tcpipe ({version}); install the same packages there as here")
-        if version != __version__ and isinstance(version, str):  # else it is gone again
+        if version != __version__ and isinstance(version, str):  # otherwise the scheduler forgets it
             raise _make_cluster_error(worker, version, wanted=__version__)
     return len(threads)
 
@@ -369,7 +369,7 @@ class _Answer(Generic[R]):
 
 
 def _run_on_worker(function: Callable[[T], R], task: T, level: int, version: str) -> _Answer[R]:
-    """Run a task on a worker, which has to be of the caller's version, and forward what it logs from a level on."""
+    """Run a task on a worker, which must have the caller's version, and forward its log messages above a level."""
     if version != __version__:
         raise _make_cluster_error(os.uname().nodename, __version__, wanted=version)
     said, began_s, before = list[Said](), time.process_time(), (logger.handlers, logger.level)

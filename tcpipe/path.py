@@ -23,7 +23,7 @@ _LEAST_M = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """The segments of one stretch, and what of it is in none.
+    """The segments of one section, and the metres outside segments.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Cut:
     leftover_ns: Ints
 
     def ledger(self, path: Polyline) -> dict[str, tuple[float, float]]:
-        """Return horizontal metres and seconds of the three kinds by name; together they are the stretch's."""
+        """Return horizontal metres and seconds of the three kinds by name; their sums are those of the section."""
         spans = {
             "kept": np.column_stack((self.start_ns, self.end_ns)),
             "curved": self.curved_ns,
@@ -51,13 +51,13 @@ class Cut:
 
 
 def cut_by_chord(path: Polyline, *, chord_m: float, max_arc_to_chord: float) -> Cut:
-    """Return the segments of a stretch, from its first sample on.
+    """Return the segments of a section, starting at its first sample.
 
     Parameters
     ----------
-    path : the stretch.
+    path : the section.
     chord_m : [m], d.
-    max_arc_to_chord : [1], a piece whose horizontal arc is longer than this times ``chord_m`` is too curved.
+    max_arc_to_chord : [1], a segment whose horizontal arc is longer than this times ``chord_m`` is too curved.
     """
     kept: list[tuple[int, int]] = []
     curved: list[tuple[int, int]] = []

@@ -59,7 +59,7 @@ class Meter:
     _told: float = field(default=0.0, init=False)
 
     def add(self, count: float) -> None:
-        """Count what is done."""
+        """Count finished work."""
         self._done += count
         if self._done - self._told >= self.total / 100:
             self._told = self._done

@@ -6,7 +6,7 @@
       runs/ failed/ tags/ seen/ acknowledged/ maps/ outputs/ calls/     documents, see `tcpipe.formats.documents`
       blobs/<random>/          payload: the tables of a run (track, segments, rejections, streams/<role>), or a map
       report.html              page of all runs; the page of a run is in the folder of its tables
-      index.parquet            cache of what the documents say
+      index.parquet            cache of the documents' content
 """
 
 import re
@@ -42,11 +42,11 @@ class Store:
 
     @property
     def place(self) -> Place:
-        """Where its files lie."""
+        """Location of its files."""
         return open_place(self.root)
 
     def scan(self) -> State:
-        """Return what its documents say now."""
+        """Return the current state by its documents."""
         return scan(self.place)
 
     def put(self, state: State, kind: Kind, key: str, record: Record) -> None:
@@ -71,7 +71,7 @@ class Store:
     def find_runs(self, name: str, state: State | None = None) -> list[StoredRun]:
         """Return a run under each recipe, or, for ``RUN/RECIPE``, under one; none without such a run with its tables.
 
-        Raises `StoreError`: there is such a run, but its tables are gone.
+        Raises `StoreError`: there is such a run, but its tables are missing.
         """
         state = self.scan() if state is None else state
         run_id, _, recipe_id = name.partition("/")
@@ -116,7 +116,7 @@ class Store:
             yield directory / f"{name}.zarr", put
 
     def prove(self, runs: Sequence[StoredRun]) -> dict[str, str]:
-        """Compare segments and tracks on disk with what the manifests have of them; return by run what is wrong.
+        """Compare segments and tracks on disk with the manifests; return the problems by run.
 
         From a bucket each file is verified when it is fetched.
         """

@@ -219,7 +219,7 @@ class Terminated(BaseException):
 
 
 def prepare_process() -> None:
-    """Open standard files that are closed, print what is no text as escapes, and end in order on SIGTERM and SIGHUP.
+    """Open standard files that are closed, print undecodable bytes as escapes, and end in order on SIGTERM and SIGHUP.
 
     Linear algebra gets one thread, unless the environment states otherwise: matrices here are small, more threads only
     wait for each other, and bytes would depend on their number. The cyclic garbage collector runs 70 times less often
@@ -242,7 +242,7 @@ def prepare_process() -> None:
 
 @contextmanager
 def terminate_on_signal() -> Iterator[None]:
-    """End this process on a signal even inside a library that ignores it; the next call removes what remains."""
+    """End this process on a signal even inside a library that ignores it; the next call removes its remains."""
     read_end, write_end = os.pipe()
     os.set_blocking(write_end, False)
     before = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
@@ -275,7 +275,7 @@ def _end(number: int, _: object) -> None:
 
 
 def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
-    """Where a signal came in a place that swallows errors (a destructor, a callback), let it come again."""
+    """Raise a signal again if it came in a place that ignores errors (a destructor, a callback)."""
     error = unraisable.exc_value
     if not isinstance(error, Terminated | KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
@@ -366,7 +366,7 @@ def _fail(problems: Sequence[str], code: int, error: BaseException) -> NoReturn:
 
 
 def _is_transient(error: BaseException) -> bool:
-    """Tell whether the same call may succeed later; an impossible call and a package that is not installed stay so."""
+    """Return whether the same call may succeed later; not for an impossible call or a missing package."""
     if isinstance(error, click.exceptions.Abort | KeyboardInterrupt | Terminated):
         return True
     if isinstance(error, click.UsageError | UsageError | ModuleNotFoundError):

@@ -121,7 +121,7 @@ def export(
     from tcpipe.pipeline.export import export as run
 
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # the file of every topic is open at once
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # the files of all topics are open at the same time
     exported = run(log, Path(out), topics=(*topics, *names), message_definitions=message_definitions)
     for kind, findings in (("damage", exported.damage), ("remark", exported.notes)):
         for finding in findings:

@@ -1,4 +1,4 @@
-"""``tcpipe inspect``: what a log, a map, a dataset, a run or a store holds."""
+"""``tcpipe inspect``: content of a log, a map, a dataset, a run or a store."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
 
 
 def _list_outcome(result: IngestResult, store: Location, *, several: bool, quiet: bool) -> Iterator[str]:
-    """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken.
+    """Yield the lines on the result of a log: with its findings if it is the only log, else one line and its damage.
 
     With ``quiet`` an unchanged log without a new problem has no line.
     """
@@ -328,7 +328,7 @@ def prune(*, runs: tuple[str, ...], store: str, recipe: str | None, forget: tupl
     """Remove superseded runs, and those of earlier recipes that the current one replaces; or each RUN or RUN/RECIPE.
 
     tcpipe also removes files of killed calls. It keeps runs that a dataset needs and folders that contain files of
-    others. While another call works on the store it removes nothing.
+    others. It removes nothing while another call works on the store.
     """
     from tcpipe.pipeline.prune import prune as run
 

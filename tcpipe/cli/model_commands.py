@@ -51,7 +51,7 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     RMSE and MAPE of power, velocity, time and energy by terrain class; baselines, centred by the same rule; the
     coverage of intervals; the ablation of the input layers; the expected time; the noise floor of the labels; all with
     the values of the paper. predictions.parquet has every prediction. OUT may be a URL in a bucket, where each
-    evaluation is a folder of its own.
+    evaluation has its own folder.
 
     With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals, in
     drives.json of OUT; DATASET, which MODEL was trained on, shows whether a drive was held back.

@@ -115,7 +115,7 @@ def _store(context: click.Context) -> Store | None:
 
 
 complete_robots = _complete_names(_list_robots)
-"""Offers the robots that the recipe knows."""
+"""Type of an option that offers the robots of the recipe."""
 complete_scenarios = _complete_names(lambda _: import_module("tcpipe.simulation.scenarios").SCENARIOS)
 """Offers the sites that can be simulated."""
 complete_runs = _complete_names(
@@ -139,7 +139,7 @@ LOG = Place(atomic.check_input, urls=True)
 ONE_OF_SEVERAL = Place(str)
 """A log or raster, by pattern or address; the command checks each one and reports all problems at once."""
 PATH_OR_RUN = Place(str)
-"""A path or URL, or the name of a run; the command looks up what it is."""
+"""A path or URL, or the name of a run; the command finds out which."""
 
 
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -265,7 +265,7 @@ def make_click_option(name: str, default: Any, shown: options.Option) -> Option:
 def add_options(cls: type[Any]) -> Option:
     """Return a decorator that adds the options of a dataclass to a command, which receives them as one object.
 
-    What is not given has the default of the dataclass, which may be another than the one that is shown.
+    Options that are not given have the default of the dataclass, which may differ from the default in the help.
     """
     declared = {
         field.name: (field.default, field.metadata["option"]) for field in fields(cls) if "option" in field.metadata
@@ -363,4 +363,4 @@ seed_option = make_click_option("seed", 1, options.Option("Seed of the simulated
 """``--seed`` of a simulation."""
 
 dry_run_option = make_click_option("dry_run", False, options.DRY_RUN)
-"""``--dry-run``: nothing is done."""
+"""``--dry-run``: change nothing."""

@@ -62,7 +62,7 @@ def _open_terminal(*, as_json: bool) -> Console | None:
 
 
 NEXT_STEP = "tcpipe.next_step"
-"""Key of click's context for what to do after a command, where its result decides."""
+"""Key in click's context of the advice after a command, if it depends on the result."""
 
 _LONGEST_NAME = 40
 
@@ -107,7 +107,7 @@ class Progress:
             self._print(text)
 
     def problem(self, *lines: str) -> None:
-        """Print what went wrong, also where progress is not wanted."""
+        """Print an error, also if progress is off."""
         for text in lines:
             self._print(f"tcpipe: {text}")
 
@@ -119,12 +119,12 @@ class Progress:
             print_line(text)
 
     def note(self, text: str, *, as_json: bool) -> None:
-        """Print a line that is no result, beside JSON on stderr; a reader that is gone is no reason to stop."""
+        """Print a line that is no result, with JSON on stderr; continue if the reader has ended."""
         with suppress(OSError):
             (self.line if as_json else self.result)(text)
 
     def _print(self, text: str) -> None:
-        with suppress(OSError):  # nobody listening is no reason to stop
+        with suppress(OSError):  # continue without a reader
             if self._bars is not None:
                 self._bars.console.print(clean_line(text), markup=False, highlight=False, soft_wrap=True)
             else:

@@ -40,21 +40,21 @@ class Metres:
     measured: Floats
     class_id: AnyInts
     distance_m: Floats
-    """Distance of its start along the run."""
+    """Distance of the start of each metre along the run."""
     length_m: Floats
     duration_s: Floats
-    """Predicted."""
+    """Predicted duration of each metre."""
     rise_m: Floats
-    """Over each, uphill positive."""
+    """Rise over each metre, uphill positive."""
     turn_rad: Floats
-    """Over each, both ways counted."""
+    """Sum of absolute turns over each metre."""
     stated_std: Floats | None = None
     """Standard deviation that the model states; None: the usual one."""
     is_near: Mask | None = None
-    """Whether each is near training ground; None: none is."""
+    """Whether each metre is near training ground; None: no metre is."""
 
     def take(self, rows: Mask) -> Metres:
-        """Return some of them."""
+        """Return the metres in ``rows``."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return replace(self, **{name: value[rows] for name, value in values.items() if value is not None})
 

@@ -57,7 +57,7 @@ def measure_coverage(is_inside: Mask, runs: GenericArray) -> Coverage:
 
 
 def find_miscalibration(found: Coverage, quantity: str, subject: Subject) -> Iterator[Finding]:
-    """Yield that intervals of ``time`` or ``energy`` are too narrow or too wide, where the runs suffice to say so."""
+    """Yield that intervals of ``time`` or ``energy`` are too narrow or too wide, if there are enough runs."""
     if found.low is None or found.high is None:
         return
     if found.high < COVERAGE and found.fraction < read_threshold(f"{quantity}-overconfident", "min_coverage_fraction"):

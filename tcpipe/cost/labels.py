@@ -9,8 +9,8 @@ power P_end there::
 so an error e of the displacement between both ends, whose standard deviation includes their correlation, is an error of
 every label.
 
-Part of σ is one error common to all segments of a run: the scale of a lone odometry, gain and zero of the power sensor,
-the idle power. It has separate columns, since it adds up linearly over a path, while the rest averages out.
+Part of σ is one error common to all segments of a run: the scale of a single odometry, gain and zero of the power
+sensor, the idle power. It has separate columns, since it adds up linearly over a path, while the rest averages out.
 
 Quality bits of labels; none of them removes a segment.
 """
@@ -61,8 +61,8 @@ class SensorError:
     Attributes
     ----------
     gain_fraction : of its gain, shape (M,) or a number.
-    offset_joule : what an error of its zero changes of each segment's energy [J], shape (M,) or a number.
-    sign_joule : what a lost sign changes [J], likewise.
+    offset_joule : change of each segment's energy by an error of its zero [J], shape (M,) or a number.
+    sign_joule : change of each segment's energy by a lost sign [J], shape (M,) or a number.
     """
 
     gain_fraction: Floats | float = 0.0
@@ -174,7 +174,7 @@ def estimate_energy_budget(energy_joule: Floats, variance_j2: Mapping[str, Float
 
 
 def pool_budgets(budgets: Iterable[EnergyBudget | None]) -> EnergyBudget | None:
-    """Return the budget of several sets of segments together; None of none."""
+    """Return the budget of several sets of segments together; None without any."""
     known = [asdict(budget) for budget in budgets if budget is not None]
     count = sum(each["segments"] for each in known)
     if not count:
@@ -213,12 +213,12 @@ def combine_flags(flags: dict[Quality, Mask], count: int) -> NDArray[np.uint32]:
 
 
 def find_wanted_rate(*, averaged: bool) -> float:
-    """Return how often power is wanted [Hz]."""
+    """Return the required rate of power [Hz]."""
     return MIN_AVERAGED_HZ if averaged else MIN_INSTANTANEOUS_HZ
 
 
 def is_too_slow(rate_hz: float, *, averaged: bool) -> bool:
-    """Return whether power at a rate [Hz] comes less often than is wanted."""
+    """Return whether a rate of power [Hz] is below the required rate."""
     return rate_hz < _RATE_TOLERANCE * find_wanted_rate(averaged=averaged)
 
 

@@ -79,7 +79,7 @@ class FitSamples:
     terrain: Texts
 
     def take(self, rows: Ints | Mask) -> FitSamples:
-        """Return some of them."""
+        """Return the samples in ``rows``."""
         return FitSamples(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
@@ -89,13 +89,13 @@ class Physics:
 
     Attributes
     ----------
-    terms : term and class of each coefficient (standing, drivetrain, rolling, grade or turning; terrain class or
+    terms : term and class of each coefficient (idle, drivetrain, rolling, grade or turning; terrain class or
         `ALL`), J of them.
     value : P0 [W], D [N], F [N], N [N], M [W per rad/s], shape (J,).
-    covariance : of the values, shape (J, J); 0 where a coefficient stands at zero.
+    covariance : of the values, shape (J, J); 0 where a coefficient is bounded at zero.
     recovered : k, share of downhill work that comes back; 0 unless steep downhill segments determine it.
-    residual_watt : robust standard deviation of what is left [W], at least 2 % of the power.
-    segments : how many segments it is fitted on.
+    residual_watt : robust standard deviation of the residuals [W], at least 2 % of the power.
+    segments : number of fitted segments.
     """
 
     terms: tuple[tuple[str, str], ...]
@@ -151,7 +151,7 @@ def fit_physics(metres: FitSamples, *, idle_watt: float | None = None) -> Physic
     Parameters
     ----------
     metres : rows with NaN are left out; without any turn rate there is no term for it.
-    idle_watt : power while standing, measured at halts; None fits it where the speeds vary enough.
+    idle_watt : idle power, measured while stationary; None: fit it if the speeds vary enough.
     """
     turning = bool(np.isfinite(metres.mean_abs_yaw_rate_radps).any())
     known = metres.power_watt + metres.velocity_mps + metres.rise + (metres.mean_abs_yaw_rate_radps if turning else 0.0)
@@ -203,7 +203,7 @@ def _list_determined_terms(metres: FitSamples, *, idle_watt: float | None, turni
 
 
 def _build_design_matrix(metres: FitSamples, terms: Sequence[tuple[str, str]]) -> Floats:
-    """Return what each coefficient is multiplied with, shape (M, J)."""
+    """Return the factors of the coefficients, shape (M, J)."""
     properties = {
         "idle": np.ones_like(metres.velocity_mps),
         "drivetrain": metres.velocity_mps * np.sqrt(1.0 + metres.rise**2),  # wheels run along the surface
@@ -220,7 +220,7 @@ def _build_design_matrix(metres: FitSamples, terms: Sequence[tuple[str, str]]) -
 
 
 def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], idle_watt: float | None) -> Physics:
-    """Return coefficients by iteratively reweighted least squares on the force P / v; halts add one row.
+    """Return coefficients by iteratively reweighted least squares on the force P / v; the idle power adds one row.
 
     On downhill segments force is a product of k and coefficients: each step solves for both by its tangent
     (Gauss-Newton).
@@ -260,7 +260,7 @@ def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], idle_wat
 
 
 def _fit_non_negative(made: Floats, target: Floats) -> Floats:
-    """Return what fits best with no size below zero: mostly no bound holds, and the plain solution is it."""
+    """Return the non-negative least-squares solution; mostly it equals the unconstrained solution."""
     plain = np.asarray(np.linalg.lstsq(made, target, rcond=None)[0], float)
     return plain if (plain >= 0.0).all() else nnls(made, target)[0]
 

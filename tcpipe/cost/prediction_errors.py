@@ -2,20 +2,20 @@
 
 They are, in this order:
 
-* the **bias** of each terrain class: the ratio of its metres' true and predicted sums, minus one, as far as it is
+* the **bias** of each terrain class: the ratio of its metres' true and predicted sums, minus one, where it is
   beyond chance. With b the ratio of a class, b0 that of all and s its standard error over blocks of the drives: b0 + (b
   - b0) max(0, 1 - s² / (b - b0)²) (James and Stein's positive part; Efron and Morris, JASA 70, 1975), and no larger
   than without any single fold of the cross-validation. Predictions are multiplied by it, so that they are centred.
-* the **spread** of one metre, a + c |prediction| + e s, with a factor of the class that few samples hardly move from 1.
-  s is the standard deviation that the model itself predicts, 0 without one: it counts as far as held-out errors follow
-  it. Errors of a single fold vary from fold to fold (by 31 % for networks): spreads are then as much wider as Student's
-  t of 5 degrees of freedom, whose scale is as uncertain.
+* the **spread** of one metre, a + c |prediction| + e s, with a factor of the class, which is close to 1 for few
+  samples. s is the standard deviation that the model itself predicts, 0 without one: it counts as far as held-out
+  errors follow it. Errors of a single fold vary from fold to fold (by 31 % for networks): spreads are then as much
+  wider as Student's t of 5 degrees of freedom.
 * the **correlation** of two metres of one run by their distance, from the products of errors over their spread. A
   segment's end is the next one's beginning, so that the correlation of neighbours may be negative; beyond, it never
   rises, and distances with few pairs are combined.
 * the **variance of a run's own error**: variance of the means of runs beyond the correlated errors of their metres,
   widened by Student's t for few runs.
-* the **common error** of the labels (gain and zero of the power sensor, scale of a lone odometry): held-out samples
+* the **common error** of the labels (gain and zero of the power sensor, scale of a single odometry): held-out samples
   contain it, so that no residual shows it. Its share of the labels' sum comes from the columns of their standard
   deviations.
 
@@ -46,7 +46,7 @@ COVERAGE = 0.9
 """Share of drives that an interval is to cover."""
 
 FEWEST = 20
-"""Fewest held-out samples for errors, and of a class for a bias of its own."""
+"""Fewest held-out samples to estimate errors, and fewest of a class to estimate its bias."""
 
 _TAIL = (1.0 - COVERAGE) / 2.0
 NORMAL_HALF_WIDTH = 1.6448536269514722
@@ -90,7 +90,7 @@ class SumDistribution:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Return the ends of the interval of `COVERAGE` of what the robot's sensors measure."""
+        """Return the ends of the interval of `COVERAGE` for values that the robot's sensors will measure."""
         return self.middle - NORMAL_HALF_WIDTH * self.std_below, self.middle + NORMAL_HALF_WIDTH * self.std_above
 
     def compute_quantile(self, probability: float) -> float:
@@ -111,7 +111,7 @@ class QuantityErrors:
     Attributes
     ----------
     floor, share : the spread of a metre of all ground is ``floor`` + ``share`` |prediction|.
-    of_class : by what it is multiplied, by class id, shape (256,).
+    of_class : factor of each class, by class id, shape (256,).
     low, high : 5 % and 95 % quantiles of the errors over their spread.
     bias_std : standard error of the class's bias, of the prediction, shape (256,).
     common_share : standard deviation of the labels' common error, of the prediction; 0 if the labels state none.
@@ -380,7 +380,7 @@ class _Held:
 
 
 def _fit_bias(predicted: Floats, true: Floats, held: _Held) -> Bias:
-    """Return the bias of all ground, and of each class as far as it is beyond chance."""
+    """Return the bias of all ground, and of each class if it is significant."""
     block = held.run
     if np.unique(block).size < _ENOUGH_RUNS:
         block = np.cumsum(np.r_[True, np.diff(held.run) != 0] | (np.arange(predicted.size) % _BLOCK == 0)) - 1
@@ -389,7 +389,7 @@ def _fit_bias(predicted: Floats, true: Floats, held: _Held) -> Bias:
     everywhere *= max(0.0, 1.0 - (error / everywhere) ** 2) if everywhere else 0.0
     value, std = np.full(_CLASSES, everywhere), np.full(_CLASSES, error)
     numbers, counts = np.unique(held.class_id, return_counts=True)
-    for number in numbers[counts >= FEWEST].tolist():  # fewer lie in a block or two, which tell no chance
+    for number in numbers[counts >= FEWEST].tolist():  # fewer samples are in one or two blocks, which show no variation
         own = held.class_id == number
         found, chance = _estimate_ratio(predicted[own], true[own], block[own])
         beyond = _drop_bias_of_a_fold(found, everywhere, predicted[own], true[own], held.fold[own]) - everywhere
@@ -460,13 +460,13 @@ def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Fl
 
 
 def _estimate_run_variance(errors: QuantityErrors, error: Floats, spread: Floats, run: Ints) -> float:
-    """Return the variance of a run's own error over its spread, beyond what errors of its metres leave in its mean.
+    """Return the variance of a run's own error over its spread, beyond the mean of the errors of its metres.
 
     It is raised so that a normal interval of the mean error of a new run is as wide as that of Student's t. Runs count
     by their length (DerSimonian and Laird, Controlled Clinical Trials 7, 1986).
     """
     runs = np.unique(run)
-    if runs.size < 2:  # nothing but the farthest metres tell it
+    if runs.size < 2:  # only the farthest metres determine it
         return max(float(errors.correlation[-1]), 0.0)
     weight = np.array([spread[run == number].sum() for number in runs])
     means = np.array([error[run == number].sum() for number in runs]) / weight

@@ -14,11 +14,11 @@ from scipy.special import stdtrit
 from tcpipe.arrays import AnyInts, Floats, Ints
 from tcpipe.tables.facts import Floor
 
-_FEWEST_FITTED = 12  # below so many samples a class is described by its mean, not by a parabola over slope
+_FEWEST_FITTED = 12  # fewest samples of a class for a parabola over slope; else its mean
 
 
 def compute_slope_residuals(values: Floats, terrain_class: AnyInts, slope_rad: Floats) -> Floats:
-    """Return what a parabola over slope, one a class, leaves of a label, shape (N,)."""
+    """Return the residuals of a label from a parabola over slope for each class, shape (N,)."""
     left = np.empty(len(values))
     for kind in np.unique(terrain_class):
         rows = np.flatnonzero(terrain_class == kind)
@@ -29,12 +29,12 @@ def compute_slope_residuals(values: Floats, terrain_class: AnyInts, slope_rad: F
 
 
 NEAR = 0.25
-"""Footprints whose centres are at most so many chords apart are one place."""
+"""Largest distance of centres of footprints at one place [chords]."""
 
 ALONG_RAD = np.radians(10.0)
 """Largest difference of courses of one direction [rad]; with NEAR it bounds position and course as an ellipsoid."""
 
-_CHUNK = 65_536  # samples whose nearest are looked for together
+_CHUNK = 65_536  # samples per nearest-neighbour query
 _BLOCK = 10.0  # side of a jackknife block, in chords
 _FEWEST_BLOCKS = 5
 _CONFIDENCE = 0.95

@@ -19,7 +19,7 @@ Batch = tuple[Floats32 | tuple[Floats32, Floats32], ...]
 Pixels = dict[str, LayerPixels]
 
 IN_MEMORY_BYTES = 2 << 30
-"""A split whose stored layers are smaller is kept in memory; the paper's whole dataset takes 70 MB."""
+"""Largest size of the stored layers of a split in memory [byte]; the paper's whole dataset takes 70 MB."""
 
 CACHED_PIECES = 64
 """Pieces kept for reading at random from a split that is not in memory."""
@@ -28,7 +28,7 @@ _FLIPPED = ("cross_slope_rad",)
 """Columns whose sign changes when a sample is mirrored across its direction of travel."""
 
 _POOL_PIECES = 16
-"""Pieces whose samples are shuffled among each other: 4096 samples of a Zarr dataset, 26 MB."""
+"""Number of pieces that are shuffled together: 4096 samples of a Zarr dataset, 26 MB."""
 
 
 class StoredPixels:
@@ -63,7 +63,7 @@ class StoredPixels:
         return self._read(self.rows[at], layers)
 
     def find_pieces(self, at: Ints) -> Ints:
-        """Return the piece that holds each of the samples ``at``, (M,)."""
+        """Return the piece that contains each of the samples ``at``, (M,)."""
         return np.searchsorted(self.files.starts, self.rows[at], side="right") - 1
 
     def pools(
@@ -94,7 +94,7 @@ class StoredPixels:
             yield pool, found[shuffled], which[shuffled]
 
     def _read(self, rows: Ints, layers: Sequence[str]) -> Pixels:
-        """Read the pieces that hold ``rows`` (of the files), each once."""
+        """Read the pieces that contain ``rows`` (of the files), each once."""
         out: Pixels = {layer: self.files.make_room(layer, len(rows)) for layer in layers}
         piece_of = np.searchsorted(self.files.starts, rows, side="right") - 1
         pieces = np.unique(piece_of).tolist()

@@ -1,4 +1,4 @@
-"""Extra features of segments beside their patches: numbers that a model may take and a planner knows, too."""
+"""Extra features of segments in addition to patches: numbers that are also known when a path is planned."""
 
 from __future__ import annotations
 

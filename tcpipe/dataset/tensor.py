@@ -92,7 +92,7 @@ class TensorLayout:
 
     @property
     def batch_rows(self) -> int:
-        """Samples whose tensors are formed at once where all are wanted one after another: 40 MB, 2,048 at most."""
+        """Most samples in one batch of tensors if all samples are read in order: 40 MB, at most 2,048."""
         return max(min(_BATCH_BYTES // (4 * self.depth * self.patch_px**2), _BATCH_ROWS), 1)
 
     def _name_layer(self, channel: str) -> str:

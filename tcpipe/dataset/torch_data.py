@@ -12,7 +12,7 @@ from tcpipe.dataset.batches import Batches
 class TorchBatches(IterableDataset[Any]):
     """Whole batches as tensors; the workers of a loader divide the split among them, and every pass is another epoch.
 
-    It has no length: with several workers each ends with a batch of its own that is not full.
+    It has no length: with several workers each worker's last batch may be smaller.
     """
 
     def __init__(self, batches: Batches) -> None:

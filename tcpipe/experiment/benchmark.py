@@ -3,7 +3,7 @@
 ::
 
     benchmark.json, benchmark.html          the tables
-    DATASET/KIND-SEED/model, evaluation     each training, and its evaluation; what is complete is not made again
+    DATASET/KIND-SEED/model, evaluation     each training, and its evaluation; complete ones are not repeated
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -108,9 +108,9 @@ def run_benchmark(
 
     Parameters
     ----------
-    datasets, kinds : what is trained, on what; names of datasets differ.
-    seeds : trainings of a network or an own model; the other kinds are the same for each seed and are trained once.
-    predictor : code of an own model, which joins the kinds.
+    datasets, kinds : every kind is trained on every dataset; names of datasets differ.
+    seeds : number of trainings of a network or own model; other kinds do not depend on the seed and are trained once.
+    predictor : code of an own model, which is compared with the kinds.
     config, evaluating : settings of all trainings and evaluations.
     """
     place, names = Path(out), [Path(dataset).name for dataset in datasets]

@@ -29,7 +29,7 @@ _PAPER_RATIO = {HEIGHTS: (21.51 / 34.52, 26.63 / 32.92), GRASS: (21.51 / 51.39, 
 """RMSE of E of the one network over that of another, on test and on unseen (the paper's table IV)."""
 
 FEWEST_SEEDS = 5
-"""Trainings without which no claim is decided: one of them says nothing of how far another would be."""
+"""Fewest trainings to decide a claim: a single training does not show how much trainings differ."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,11 +27,11 @@ Batch = tuple[Floats32, Floats32]
 ALL_LAYERS, HEIGHTS, GRASS = "a net per class, all layers", "Wei & Isler, a net per class", "Wei & Isler, grass only"
 
 FEWEST = 20
-"""Samples of a class in train that a network of its own needs."""
+"""Fewest training samples of a class for a network of this class alone."""
 
 
 class EnergySamples(Samples):
-    """Samples whose label is the energy alone."""
+    """Samples with energy as their only label."""
 
     @cached_property
     def labels(self) -> Floats:

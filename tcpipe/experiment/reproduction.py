@@ -58,7 +58,7 @@ QUICK = Experiment(
     "This is a quick run: the small site, a narrow network, few epochs. It only shows that all steps run: "
     "do not use its numbers.",
 )
-"""Two minutes on two cores: all steps run; its figures mean nothing."""
+"""Two minutes on two cores: tests all steps; its figures have no meaning."""
 
 Size = Literal["full", "small", "quick"]
 
@@ -112,7 +112,7 @@ def reproduce(
     Parameters
     ----------
     directory : the output: new, empty, or an earlier reproduction of the same size, which resumes.
-    size : the paper's; the small site, for claims over many trainings; or the same with few epochs, to see it run.
+    size : the paper's; the small site, for claims over many trainings; or the small site with few epochs, as a test.
     seeds : number of trainings; five or more decide claims.
     jobs : logs read side by side.
     baselines : train the networks of Wei and Isler; without them their claims are not measured.

@@ -36,10 +36,10 @@ _LONGEST_NAME = 200
 """Bytes of a place's name in that of its holder."""
 
 _BEFORE = ".before"
-"""In a holder: what was at the place, where the system cannot exchange two directories in one step."""
+"""Name in a holder of the earlier directory, if the system cannot exchange two directories in one step."""
 
 _UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}
-"""Errors that only writing can meet, whatever file they name."""
+"""Errors that only writing can cause, for any file name."""
 
 _LAST_WRITE_S = 0.05
 """Where writing is broken off by a signal, a thread of zarr still finishes the small file it is at."""
@@ -85,7 +85,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def put_file(path: Path, data: bytes, *, staging: Path) -> None:
-    """Write a synced file in place of an earlier one; `make_working_directory` in ``staging`` holds it until then."""
+    """Write a synced file in place of an earlier one; until then it is in `make_working_directory` of ``staging``."""
     with _convert_os_errors(path), _make_parents(path) as place, make_working_directory(staging) as directory:
         temporary = directory / "new"
         with temporary.open("wb") as stream:
@@ -121,7 +121,7 @@ def make_scratch_directory() -> Iterator[Path]:
 
 
 def clear_scratch() -> None:
-    """Remove what killed processes left of their scratch directories."""
+    """Remove scratch directories of killed processes."""
     for left in Path(tempfile.gettempdir()).glob(f"{_make_scratch_prefix()}*"):
         _remove_if_abandoned(left, lambda left=left: shutil.rmtree(left))  # type: ignore[misc]
 
@@ -131,7 +131,7 @@ def _make_scratch_prefix() -> str:
 
 
 def make_lasting_scratch() -> Path:
-    """Return a `make_scratch_directory` that goes when this process ends."""
+    """Return a `make_scratch_directory` that is removed when this process ends."""
     context = make_scratch_directory()
     directory = context.__enter__()
     atexit.register(context.__exit__, None, None, None)
@@ -177,10 +177,10 @@ def lock_directory(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def _convert_os_errors(path: Path) -> Iterator[None]:
-    """Turn what the operating system says while ``path`` is written into one line about ``path`` itself.
+    """Convert errors of the operating system while ``path`` is written into one line about ``path``.
 
-    An error that names another file is of that file: what is read for ``path``. One that names none is of writing,
-    whatever its number, as readers turn theirs into errors of their own.
+    Errors that name another file stay unchanged: that file is read for ``path``. Errors that name no file come from
+    writing, since readers convert their own errors.
     """
     try:
         yield
@@ -196,7 +196,7 @@ def _convert_os_errors(path: Path) -> Iterator[None]:
 
 def _is_of_writing(error: OSError, place: Path) -> bool:
     if error.filename is None:
-        return not isinstance(error, ConnectionError)  # nobody reads any more what is printed
+        return not isinstance(error, ConnectionError)  # the reader of the output has ended
     named = Path(os.path.realpath(os.fsdecode(error.filename)))
     return error.errno in _UNWRITABLE or TEMPORARY_PREFIX in str(named) or named in (place, *place.parents)
 
@@ -260,18 +260,18 @@ def _make_prefix(name: str) -> str:
 
 
 def clear(directory: Path) -> None:
-    """Put a directory in order after killed writers: what they took away comes back, what they left behind goes."""
+    """Clean a directory after killed writers: restore files that they moved, and remove their temporaries."""
     for holder in _list_holders(check_local_output(directory)):
         _remove_if_abandoned(holder, lambda holder=holder: _clear_holder(holder))  # type: ignore[misc]
 
 
 def clear_beside(path: Path) -> None:
-    """Clear the directory in which ``path`` lies, or would."""
+    """Clear the directory of ``path``, which need not exist."""
     clear(Path(os.path.realpath(check_local_output(path))).parent)
 
 
 def find_leftovers(path: Path) -> list[Path]:
-    """Return what killed writers of ``path`` left beside it."""
+    """Return temporaries of killed writers of ``path`` in its directory."""
     place = Path(os.path.realpath(path))
     mine = (holder for holder in _list_holders(place.parent) if holder.name.startswith(_make_prefix(place.name)))
     return [holder for holder in mine if is_abandoned(holder)]
@@ -285,7 +285,7 @@ def is_abandoned(holder: Path) -> bool:
 def _list_holders(directory: Path) -> list[Path]:
     try:
         names = [entry.name for entry in os.scandir(directory) if entry.name.startswith(TEMPORARY_PREFIX)]
-    except OSError:  # nothing to be cleared here, or by us
+    except OSError:  # nothing to clear, or no permission
         return []
     return [directory / name for name in sorted(names) if _HOLDER.fullmatch(name)]
 
@@ -293,7 +293,7 @@ def _list_holders(directory: Path) -> list[Path]:
 def _clear_holder(holder: Path) -> None:
     before = holder / _BEFORE
     if before.exists():
-        for written in holder.iterdir():  # beside what was there: what was to take its place, under its name
+        for written in holder.iterdir():  # next to the earlier directory: the new one, under its final name
             if written != before and not os.path.lexists(holder.parent / written.name):
                 before.rename(holder.parent / written.name)
     shutil.rmtree(holder)
@@ -350,7 +350,7 @@ def _sync(path: Path) -> None:
 
 
 def describe_full_disk(error: Exception) -> str:
-    """Say that there is no room for a copy of a log, where that is the error; else nothing."""
+    """Return the message that the disk is too full for a copy of a log; "" for other errors."""
     full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     return "no room for a copy here; TMPDIR names a place that has some" if full else ""
 
@@ -397,7 +397,7 @@ def check_input(path: Location, wanted: str = "file or directory") -> Path:
 
 
 def _find_kind(path: Path) -> str | None:
-    """Return what is at a path, None for nothing; `PermissionError` where that cannot be seen."""
+    """Return the kind of file at a path, None if it is missing; `PermissionError` if access is denied."""
     try:
         mode = path.stat().st_mode
     except PermissionError:

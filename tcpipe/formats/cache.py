@@ -1,4 +1,4 @@
-"""A cache of limited size on this machine: tcpipe does not fetch from a bucket again what it has fetched once.
+"""A cache of limited size on this machine: tcpipe fetches an object from a bucket only once.
 
 A key determines the content (a sha256; an object's version and a range of it), so no file here is ever outdated. The
 cache is the directory ``TCPIPE_CACHE``, else one in the user's cache directory. Above ``TCPIPE_CACHE_BYTES`` (8 GB) it
@@ -34,7 +34,7 @@ def fetch_cached(key: str, fetch: Callable[[Path], object]) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         fetch(temporary)
         put = temporary.stat()
-        # Not synced: readers compare checksums. What a killed process leaves is removed in its turn.
+        # Not synced: readers compare checksums. Files of killed processes are removed as least recently used files.
         temporary.replace(path)
     except OSError as error:
         message = f"{path}: cannot be written ({error.strerror or error}); set TCPIPE_CACHE to use another directory for downloads"
@@ -85,7 +85,7 @@ def _read_cache_limit() -> int:
 
 
 def _make_room(directory: Path, most: int, *, now: float) -> None:
-    """Remove the least recently used files until the limit holds."""
+    """Remove the least recently used files until the size is below the limit."""
     files = []
     for path in directory.glob("??/*"):
         with suppress(OSError):

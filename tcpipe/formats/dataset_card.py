@@ -131,12 +131,12 @@ class LabelColumns:
     columns: tuple[str, str]
     velocity: str
     includes: tuple[str, ...] = omit(())
-    """Loads besides the drives in the power of any run."""
+    """Loads other than the drives in the power of any run."""
 
 
 @dataclass(frozen=True, slots=True)
 class LabelStatistics:
-    """A label over train alone: what a normaliser may know, in the label's unit; null where nothing trains."""
+    """Statistics of a label over train, for normalisation, in the label's unit; null without training samples."""
 
     count: int
     mean: float | None
@@ -230,7 +230,7 @@ def list_shifts(registrations: Iterable[MapRegistration]) -> dict[str, tuple[flo
 
 @dataclass(frozen=True, slots=True)
 class MapSource:
-    """A map that the dataset was sampled from: where it lies and what it was made from."""
+    """A map that the dataset was sampled from: its location and its sources."""
 
     name: str
     layers: tuple[str, ...]
@@ -297,9 +297,9 @@ class DatasetCard:
     patch_m: float
     patch_px: int
     layers: Mapping[str, Description]
-    """By layer: its numpy type, what stands for no data, and its CF attributes (`tcpipe.formats.maps.map_facts`)."""
+    """By layer: its numpy type, value of no data, and CF attributes (`tcpipe.formats.maps.map_facts`)."""
     tensor: Mapping[str, str | tuple[str, ...]]
-    """``channels``, and by layer how what is stored becomes a channel from 0 to 1."""
+    """``channels``, and by layer the conversion of stored values to a channel from 0 to 1."""
     classes: tuple[TerrainClass, ...]
     label: LabelColumns
     energy_budget: EnergyBudget | None = None

@@ -67,7 +67,7 @@ _LEVELS: dict[Compression, int] = {"zstd": 3, "lz4": 5}
 """Beyond these a patch takes twice the time for less than a tenth of the room."""
 
 GROUP_ROWS = 1024
-"""Patches in one row group of a Parquet shard: 6.5 MB, what a streaming reader holds."""
+"""Patches in one row group of a Parquet shard: 6.5 MB, the memory of a streaming reader."""
 
 
 MOST_SAMPLES = 10_000_000
@@ -189,14 +189,14 @@ def make_zarr_writers(
 
 
 def _choose_shard_rows(samples: int) -> int:
-    """Return how many patches a shard holds in a Zarr dataset of so many."""
+    """Return the number of patches in a shard of a Zarr dataset with ``count`` patches."""
     return min(SHARD_ROWS, max(-(-samples // CHUNK_ROWS), 1) * CHUNK_ROWS)
 
 
 def _open_layer_array(
     directory: Path, layer: Layer, samples: int, px: int, fetched: FetchedShards | None = None
 ) -> ShardedArray:
-    """Return the array of a layer; `StoreError` if its description is not of so many patches of so many pixels."""
+    """Return the array of a layer; `StoreError` if its shape differs from the expected number of patches and pixels."""
     return open_sharded(
         directory / PATCHES / layer.name,
         shape=(samples, px, px),
@@ -313,7 +313,7 @@ def sample_columns(directory: Path) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class PatchFiles:
-    """Where a dataset's patches lie, piece by piece; a piece is what is decoded together.
+    """Locations of a dataset's patches by piece; a piece is decoded as a whole.
 
     ``starts`` are the first rows of the pieces and, last, the number of rows, shape (P + 1,), in the order of the
     files.
@@ -331,12 +331,12 @@ class PatchFiles:
     """Where the files are; None: on this machine."""
 
     def make_room(self, layer: str, rows: int) -> LayerPixels:
-        """Return an empty array for so many stored patches of a layer."""
+        """Return an empty array for a number of stored patches of a layer."""
         return np.empty((rows, self.patch_px, self.patch_px), self.layers[layer].stored)
 
     @property
     def piece_rows(self) -> int:
-        """Room that a piece needs; the last one may hold fewer rows."""
+        """Size of a decoded piece [byte]; the last one may contain fewer rows."""
         return CHUNK_ROWS if self.arrays else GROUP_ROWS
 
     def expect(self, pieces: Iterable[int], layers: Iterable[str]) -> None:
@@ -376,12 +376,12 @@ class PatchFiles:
 
 
 def is_shard(name: str) -> bool:
-    """Tell whether a file of a dataset holds patches, of which a part is read at a time."""
+    """Return whether a file of a dataset contains patches, which are read in parts."""
     return name.startswith(f"{SHARDS}/") or (name.startswith(f"{PATCHES}/") and "/c/" in name)
 
 
 def open_patches(directory: Path, card: DatasetCard, fetched: FetchedShards | None = None) -> PatchFiles:
-    """Return where the patches of a dataset lie, here or ``fetched``.
+    """Return the locations of a dataset's patches, here or ``fetched``.
 
     Shards are compared with the card: on this machine at once, in a bucket each before it is first read.
     A digest is computed once and remembered. A dataset without patches has no layers.

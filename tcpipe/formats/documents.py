@@ -4,11 +4,11 @@
 
     runs/0123456789abcdef.2.fedcba9876543210.json    kind / key . number . digest; written once and never changed
     blobs/5f0c6a7be1d29c04/segments.parquet          payload in a folder with a random name; a document names the folder
-    index.parquet                                    cache of what documents say, by name; it may be deleted
+    index.parquet                                    cache of the documents' content, by name; it may be deleted
 
 Rules (ADR-36):
 
-1. Bytes whose sha256 does not begin with the digest in their name are no document: they are damaged, or half copied.
+1. Bytes whose sha256 does not begin with the digest in their name are no document: they are damaged, or copied in part.
 2. For each kind and key the document with the highest number counts; of several with this number, the one with the
 smallest digest.
    A writer uses 1 + the highest number that it saw.
@@ -104,7 +104,7 @@ class State:
     is_new: bool = True
     """Whether there is no document at all."""
     read: int = 0
-    """Documents that the index did not hold."""
+    """Documents that are not in the index."""
     _joined: dict[str, RunFacts] | None = None
 
     @property
@@ -179,11 +179,11 @@ class State:
         return sorted(rows, key=lambda row: (row.run_id, row.recipe_id))
 
     def has_payload(self, row: RunFacts) -> bool:
-        """Return whether the folders of a run are there; what is in them is read by `tcpipe verify`."""
+        """Return whether the folders of a run exist; `tcpipe verify` reads their content."""
         return row.blob in self.blobs and (not row.streams or row.streams_blob in self.blobs)
 
     def find_seen(self, log: tuple[str, ...]) -> LogSnapshot | None:
-        """Return the log as it was when it was seen last; None of a new one."""
+        """Return the last recorded state of the log; None for a new log."""
         found: LogSnapshot | None = self.facts["seen"].get(make_key(find_lineage(log)))
         return found
 
@@ -217,8 +217,8 @@ Beginning: TypeAlias = tuple[str, str, int, str]
 
 
 def _find_beginning(row: RunFacts) -> Beginning | None:
-    """Return what identifies the beginning of a run's log; None if the run was pruned or has no measurements."""
-    if row.recording is None or not row.blob:  # what was pruned takes the place of nothing
+    """Return the identity of the beginning of a run's log; None if the run was pruned or has no measurements."""
+    if row.recording is None or not row.blob:  # a pruned run replaces no other run
         return None
     return row.robot, row.ingest_key, row.recording.first_ns, row.recording.beginning
 
@@ -234,7 +234,7 @@ _DECODED: dict[str, dict[str, Record]] = {}
 
 
 def scan(place: Place) -> State:
-    """Return what the documents of a store say now."""
+    """Return the current state of a store from its documents."""
     where = place.where()
     if where not in _DECODED:
         _DECODED.clear()
@@ -311,7 +311,7 @@ def _read_document(place: Place, name: Name) -> bytes | None:
 
 
 def _read_index(place: Place) -> dict[str, bytes]:
-    """Return what the index has of documents by name."""
+    """Return the documents in the index, by name."""
     with suppress(StoreError, KeyError):
         table = read_parquet_bytes(place.read(INDEX) or b"", INDEX)
         rows = dict(zip(table["name"].to_pylist(), table["facts"].to_pylist(), strict=True))
@@ -344,7 +344,7 @@ def put_document(place: Place, state: State, kind: Kind, key: str, record: Recor
 
 
 def read_record(place: Place, name: str, cls: type[T]) -> T:
-    """Return the whole record in a document; `StoreError` where it is gone or not as it was written."""
+    """Return the whole record in a document; `StoreError` if it is missing or has changed."""
     kind, _, file = name.partition("/")
     parsed = parse_name(cast("Kind", kind), file)
     data = None if parsed is None else _read_document(place, parsed)

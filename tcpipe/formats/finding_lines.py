@@ -46,7 +46,7 @@ _DAMAGE: Mapping[str, str] = {
 }  # fmt: skip
 """Numbers that follow a line in brackets, where they are more than zero and the template lacks them."""
 _EVIDENCE = ("field", "wanted", "joints", "platforms")
-"""Names that follow likewise, where the template lacks them."""
+"""Names that are appended, if the template lacks them."""
 _MOST_SUBJECTS = 3
 _DIGITS = 3
 _LARGEST_PLAIN = 1e6
@@ -70,14 +70,14 @@ def format_number(name: str, value: float) -> str:
 
 
 def describe_finding(finding: Finding) -> str:
-    """Return what was observed, in one line without its remedy and code."""
+    """Return the observation in one line, without remedy and code."""
     entry = find_entry(finding.code)
     values = {name: format_number(name, number) for name, number in finding.numbers.items()}
     if finding.span_s is not None:
         begin_s, end_s = finding.span_s
         digits = 0 if end_s - begin_s >= _SHORT_S else 1
         values["span"] = f"{begin_s:.{digits}f} to {end_s:.{digits}f} s"
-    missing = dict.fromkeys(entry.fields, "?")  # in a dataset without coordinates findings keep only what is public
+    missing = dict.fromkeys(entry.fields, "?")  # in a dataset without coordinates, findings have only public values
     line = entry.template.format(**{**missing, **values, **finding.names, "subject": finding.subject.name})
     numbers = finding.numbers.keys() - entry.fields
     details = [f"{name} {finding.names[name]}" for name in _EVIDENCE if name in finding.names.keys() - entry.fields]
@@ -123,7 +123,7 @@ def _list_changes(remedy: Remedy) -> list[str]:
 
 
 def format_finding(finding: Finding) -> str:
-    """Return a finding as one line: what was observed, its remedies or the catalogue's advice, and its code."""
+    """Return a finding as one line: the observation, its remedies or the catalogue's advice, and its code."""
     remedies = ". ".join(describe_remedy(finding, remedy) for remedy in finding.remedies)
     remedies = remedies or find_entry(finding.code).advice
     return f"{describe_finding(finding)}{f'. {remedies}' if remedies else ''}".rstrip(".") + f" [{finding.code}]"
@@ -173,7 +173,7 @@ def list_verdict(verdict: Verdict, quantities: Sequence[Affected] = AFFECTED) ->
 
 
 def describe_power(verdict: Verdict) -> list[str]:
-    """Return idle and driving power, and the energy per metre of known robots, as one line; nothing without energy."""
+    """Return idle and driving power, and the energy per metre of known robots, as one line; "" without energy."""
     finding = verdict.find_label("energy")
     if finding is None or "driving_watt" not in finding.numbers:
         return []
@@ -183,7 +183,7 @@ def describe_power(verdict: Verdict) -> list[str]:
 
 
 def describe_label(name: str, finding: Finding | None) -> list[str]:
-    """Return the size of a label with its σ, and what confirms it, as far as known."""
+    """Return the size of a label with its σ, and its witnesses, if known."""
     if finding is None:
         return [name]
     missing = f" ({finding.names['missing']})" if "missing" in finding.names else ""
@@ -266,7 +266,7 @@ def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") 
 
 
 def describe_group(group: FindingGroup[K], total: int | None, what: str) -> str:
-    """Return what was observed of a group without its title, remedy and code: how often, of what, in which range."""
+    """Return the summary of a group of findings: number, subjects and range, without title, remedy and code."""
     findings, key = group.findings, next(iter(group.of))
     if len(group.of) == 1 and len(findings) == 1:
         line = describe_finding(findings[0])

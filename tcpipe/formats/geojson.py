@@ -200,7 +200,7 @@ def _iterate_polygons(
 
 
 def _read_geometry(geometry: Json) -> NDArray[np.object_]:
-    """Return a geometry object in two dimensions, shape (1,); `ValueError` says what is wrong with it."""
+    """Return a geometry object in two dimensions, shape (1,); `ValueError` states the problem."""
     try:
         shape = None if geometry is None else shapely.from_geojson(json.dumps(geometry))
     except shapely.GEOSException as error:
@@ -252,7 +252,7 @@ class LineString:
 
 @dataclass(frozen=True, slots=True)
 class LineFeature(Generic[P]):
-    """A line and what is said of it."""
+    """A line and its properties."""
 
     properties: P
     geometry: LineString

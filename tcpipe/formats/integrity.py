@@ -1,6 +1,6 @@
-"""Seals: what lets `tcpipe verify` find one changed byte in files that no list of checksums can name (ADR-36).
+"""Checksums inside documents, by which `tcpipe verify` finds a changed byte without a separate list (ADR-36).
 
-A JSON document holds the sha256 of the rest of itself, a page that of all before its last line. What a sealed
+A JSON document contains the sha256 of the rest of itself; a page, of all text before its last line. What a sealed
 document lists, by path, size and sha256, is proved by it in turn.
 """
 
@@ -24,7 +24,7 @@ CHECKSUMS = "checksums.json"
 """In a directory whose files cannot be listed elsewhere: a sealed document with the key ``checksums``."""
 
 _SEAL_LINE = re.compile(rb'^  "document_sha256": "([0-9a-f]{64})"(,?)\n', re.MULTILINE)
-"""The seal in canonical JSON: the text without this line is what it is the hash of."""
+"""The seal in canonical JSON; its hash is that of the text without this line."""
 
 ALL_CHANGES = "; 'tcpipe verify {}' lists all changed files"
 """End of a message on one changed file."""
@@ -77,7 +77,7 @@ def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Json]], bool] = lamb
 def verify_document(
     data: bytes, where: Location, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True
 ) -> dict[str, Json]:
-    """Return the JSON object in the bytes of a document that lies at ``where``, proved; as `read_sealed`."""
+    """Return the verified JSON object in the bytes of the document at ``where``; see `read_sealed`."""
     remedy = ALL_CHANGES.format(str(where).rpartition("/")[0])
     found = parse_json(data, where, remedy=remedy)
     if not ours(found):
@@ -98,7 +98,7 @@ def write_checksums(directory: Path) -> None:
 
 
 def read_checksums(directory: Path) -> FileChecksums:
-    """Return what ``checksums.json`` has of every file of its directory; `StoreError` as `read_sealed`."""
+    """Return the checksum of every file in ``checksums.json``; `StoreError` as `read_sealed`."""
     return read_sealed_as(directory / CHECKSUMS, Checksums).checksums
 
 
@@ -109,7 +109,7 @@ def seal_page(html: str) -> str:
 
 
 def describe_broken(path: Location) -> str:
-    """Return the line about a file that is not what its seal or its checksum says."""
+    """Return the line about a file that differs from its seal or checksum."""
     return f"{path}: has changed since it was written: its checksum differs"
 
 
@@ -122,7 +122,7 @@ def find_broken_seal(data: bytes | None, where: Location) -> str | None:
 
 
 def find_wrong_checksum(where: Location, found: Checksum | None, wanted: Checksum | None) -> str | None:
-    """Return in one line how a file differs from what a document has of it (None: nothing), None if it does not."""
+    """Return one line on how a file differs from its record in a document (None: no record); None if it is equal."""
     if found is None:
         return f"{where}: is missing"
     if wanted is None:

@@ -18,10 +18,10 @@ from tcpipe.formats.atomic import Location, write_text
 
 T = TypeVar("T")
 Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]
-"""A value of a document whose form is others' (JSON-LD, CF attributes); our own documents are dataclasses."""
+"""A value in a format of another standard (JSON-LD, CF attributes); documents of tcpipe are dataclasses."""
 
 _CONVERTING = Lock()
-"""msgspec (0.22) ends the process where two threads meet a dataclass for the first time at once."""
+"""Lock: msgspec (0.22) crashes if two threads use a new dataclass at the same time."""
 
 MOST_BYTES = 32 << 20
 """A document is at most so large [byte], written and read: the card of ten thousand runs."""
@@ -101,7 +101,7 @@ def read_document(path: Path) -> bytes:
 def parse_json(
     data: bytes, path: Location, *, remedy: str = "; remove it and run the command again"
 ) -> dict[str, Json]:
-    """Return the object in the bytes of a file; `StoreError` if it holds none."""
+    """Return the JSON object in the bytes of a file; `StoreError` if they are no JSON object."""
     try:
         found = json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
@@ -131,7 +131,7 @@ def parse_typed(value: object, cls: type[T], path: Location) -> T:
 
 
 def parse_typed_json(text: str | bytes | memoryview, cls: type[T], path: Location) -> T:
-    """Return JSON text as a dataclass, or what is made of such; as `parse_typed`."""
+    """Return JSON text as a dataclass, or as a container of dataclasses; see `parse_typed`."""
     try:
         with _CONVERTING:
             return msgspec.json.decode(text, type=cls)

@@ -34,10 +34,10 @@ _SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY", "TCPIPE_RETRY_MINU
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[0-9a-f:]+\])(:\d{1,5})?(/[\w./-]*)?", re.IGNORECASE)
 _PIECE_BYTES = 1 << 24
-"""A large file is read in requests of so many bytes."""
+"""Size of a request for a part of a large file [byte]."""
 _AT_ONCE = 8
 _PERCENT_ENCODED = ("file", "http", "https")
-"""Schemes whose names are written with percent signs; object stores' own tools write them as they are."""
+"""Schemes with percent-encoded names; URLs of object stores are not encoded."""
 _FIRST_S, _FIRST_RETRY_S = 4.0, 1.0
 """The first request of a process waits so long for an answer, and is repeated for so long: a user may be watching."""
 _RETRY_MINUTES = "10"
@@ -66,7 +66,7 @@ _REFUSED = {
     "InvalidAccessKeyId": "the store does not know the access key",
     "ExpiredToken": "the credentials have expired",
 }
-"""Codes of denial that say more than that it is one."""
+"""Error codes that give the reason for denied access."""
 _CREDENTIALS = {
     "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE; AWS_SKIP_SIGNATURE=true for public data; AWS_REGION; "
     "AWS_ENDPOINT_URL",
@@ -90,11 +90,11 @@ class StoredObject:
     tag: str | None
 
     def ranges(self, spans: Sequence[tuple[int, int]]) -> list[memoryview]:
-        """Return what lies from each start to its stop, some at once."""
+        """Return the bytes of each range, with several requests in parallel."""
         return run_side_by_side(self._range, spans)
 
     def copy(self, to: Path) -> None:
-        """Write all of it to a file; `LogError` as `ranges`, and where there is no room."""
+        """Write the whole object to a file; `LogError` as in `ranges`, and if the disk is full."""
         try:
             with to.open("wb") as target:
                 for span in split_into_pieces(self.size_bytes):
@@ -135,7 +135,7 @@ def is_url(text: Location) -> bool:
 
 
 def make_absolute(place: Location) -> str:
-    """Return a path in full, or a URL as it is."""
+    """Return an absolute path, or an unchanged URL."""
     return str(place) if is_url(place) else str(Path(place).absolute())
 
 
@@ -172,7 +172,7 @@ def is_presigned(path: Location) -> bool:
 
 
 def _describe_credentials(scheme: str) -> str:
-    """Return how to give the credentials that a URL may not hold."""
+    """Return the instruction for credentials, which a URL may not contain."""
     variables = _CREDENTIALS.get(scheme.lower())
     return f"set {variables}" if variables else "give the presigned URL of a log, or copy the files to this machine"
 
@@ -181,15 +181,15 @@ def _describe_credentials(scheme: str) -> str:
 def lay_out_objects(
     url: str, *, wanted: Callable[[str], bool], by_range: tuple[str, ...]
 ) -> Iterator[tuple[Path, dict[Path, StoredObject]]]:
-    """Lay out an object, or what is wanted below a prefix, in a temporary directory, until the block ends.
+    """Represent an object, or the requested objects below a prefix, as files in a temporary directory during the block.
 
-    Yields where it lies, and by path the objects for which there are stand-ins of their size that hold nothing; others
+    Yields the path, and, by path, the objects with empty placeholders of their size; others
     are copied.
 
-    Objects whose names end as in ``by_range`` get stand-ins of their size that hold nothing; all others that are
+    Objects whose names end as in ``by_range`` get empty placeholders of their size; all others that are
     ``wanted`` are copied.
 
-    `LogError`: there is no such object, or it cannot be read; what goes wrong inside the block has the URL in place of
+    `LogError`: there is no such object, or it cannot be read; errors inside the block have the URL in place of
     the path.
     """
     shown, query = split_url(url, one_object=True)
@@ -220,7 +220,7 @@ def _place_of(url: str, directory: Path) -> Path:
 def _lay_out_stand_ins(
     url: str, query: str, directory: Path, wanted: Callable[[str], bool]
 ) -> dict[Path, StoredObject]:
-    """Lay out stand-ins, and return their objects."""
+    """Create placeholders, and return their objects."""
     found = ask_store(url, lambda store: list(_iterate_objects(store, url, query, wanted)), LogError, query=query)
     if not found:
         raise LogError(f"{url}: there is no such object, and no log below it")
@@ -250,7 +250,7 @@ def ask_store(
     bucket: str = "",
     query: str = "",
 ) -> T:
-    """Return what a request gives to which an object is ``read`` or ``written``.
+    """Return the result of a request that reads or writes an object.
 
     Without an answer the first request of a command fails within 5 s; later ones, and those of worker processes, are
     repeated for minutes. After one of them has failed, the next ones fail soon, too, until the store answers again. An
@@ -277,13 +277,13 @@ def ask_store(
 
 
 def run_side_by_side(function: Callable[[T], U], items: Sequence[T]) -> list[U]:
-    """Return what a function that asks a store gives for each item; some at once, as each answer takes a while."""
+    """Return the result of a function that queries a store for each item, with several queries in parallel."""
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         return list(pool.map(function, items) if len(items) > 1 else map(function, items))
 
 
 def _describe_store_error(url: str, error: Exception, code: str | None, what: str) -> str:
-    """Return in plain words what a store answered, and what to check."""
+    """Return the store's answer in plain words, and what to check."""
     from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError  # noqa: PLC0415
 
     text, scheme = str(error), url.partition("://")[0].lower()
@@ -316,7 +316,7 @@ def _describe_denial(scheme: str, text: str, code: str | None, what: str) -> str
 
 
 def _describe_no_answer(error: Exception) -> str:
-    """Return which address does not answer, how, and what to check."""
+    """Return the address that does not answer, the error, and what to check."""
     text = str(error)
     address, status = _ADDRESS.search(text), _STATUS.search(text)
     answer = next((words for pattern, words in _NO_ANSWER.items() if pattern in text), "the connection broke")
@@ -425,7 +425,7 @@ def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], 
         retry = {"max_retries": _MAX_RETRIES, "retry_timeout": timedelta(seconds=limit_s), "backoff": backoff}
         options = {"retry_config": retry, "client_options": client}
     options |= read_aws_profile() if scheme == "s3" else {}
-    if query:  # also where the host is a bucket's: the query stands for the credentials
+    if query:  # also for the host of a bucket: the query contains the credentials
         return obstore.store.HTTPStore.from_url(f"{container}?{query}", **options)
     return obstore.store.from_url(container, **options)
 

@@ -32,7 +32,7 @@ N = TypeVar("N", bound=np.generic)
 _M_MMAP_THRESHOLD = -3
 
 ROWS_PER_GROUP = 1 << 17
-"""Rows of a group: what is decoded together."""
+"""Rows of a group, which is decoded as a whole."""
 MOST_BYTES, MOST_TIMES = 256_000_000, 100
 """Largest table in memory [byte], and in multiples of its file: ours shrink to a tenth, except constant columns."""
 _MOST_DEPTH = 4
@@ -56,7 +56,7 @@ def write_parquet_rows(path: Path, schema: pa.Schema) -> Iterator[Callable[[pa.T
 
 
 def write_parquet_bytes(table: pa.Table, *, rows_per_group: int = ROWS_PER_GROUP) -> bytes:
-    """Return the file that `write_table` writes, in groups of so many rows."""
+    """Return the file that `write_table` writes, in groups of this many rows."""
     sink = pa.BufferOutputStream()
     with _open_writer(sink, table.schema) as writer:
         writer.write_table(table.combine_chunks(), row_group_size=rows_per_group)
@@ -136,7 +136,7 @@ def _read_bounded(data: pa.Buffer, columns: list[str] | None, group: int | None)
     source = pa.BufferReader(data)
     with pq.ParquetFile(source, metadata=about, read_dictionary=texts, page_checksum_verification=True) as file:
         table = file.read_row_groups(groups, columns)
-    for at, field in enumerate(table.schema):  # a text that occurs in many rows lies here once so far
+    for at, field in enumerate(table.schema):  # each different text is stored here once
         if pa.types.is_dictionary(field.type):
             size += sum(
                 int(pc.sum(pc.binary_length(chunk.dictionary).cast(pa.int64()).take(chunk.indices)).as_py() or 0)
@@ -194,7 +194,7 @@ def _iterate_pages(data: memoryview, chunk: pq.ColumnChunkMetaData) -> Iterator[
 def _read_struct(data: memoryview, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
     """Return a struct in Thrift's compact protocol by field number (texts and doubles as None), and where it ends.
 
-    The header of a page holds nothing else (Apache Parquet, parquet.thrift, PageHeader).
+    The header of a page contains no other fields (Apache Parquet, parquet.thrift, PageHeader).
     """
     fields, number = dict[int, Any](), 0
     while kind := data[at]:
@@ -250,7 +250,7 @@ _WGS84 = "EPSG:4326"
 
 
 def add_segments_metadata(table: pa.Table, datum: Datum | None) -> pa.Table:
-    """Return a table of segments which says where it lies; ``datum`` is the track's."""
+    """Return a table of segments with its coordinate system as metadata; ``datum`` is the track's."""
     ends = np.concatenate([read_lonlat_deg(table, "start"), read_lonlat_deg(table, "end")])
     return add_geo_metadata(table, "LineString", ends, crs=_WGS84 if datum is None else datum.crs)
 
@@ -258,10 +258,10 @@ def add_segments_metadata(table: pa.Table, datum: Datum | None) -> pa.Table:
 def add_geo_metadata(
     table: pa.Table, kind: Literal["LineString", "Point"], points_deg: Floats, *, crs: str = _WGS84
 ) -> pa.Table:
-    """Return a table whose metadata says what its column ``geometry`` holds.
+    """Return a table with metadata that describe its column ``geometry``.
 
     ``points_deg`` are longitude and latitude of all points, shape (N, 2), NaN where not known; longitude is first
-    whatever ``crs`` says.
+    independent of ``crs``.
     """
     known = points_deg[np.isfinite(points_deg).all(axis=1)]
     column: dict[str, Any] = {"encoding": "WKB", "geometry_types": [kind]}

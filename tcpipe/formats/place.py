@@ -251,9 +251,9 @@ def open_place(path: Location) -> Place:
 
 
 def _walk_files(directory: str, above: str) -> Iterator[FileEntry]:
-    """Yield the files below a directory, ``above`` before their names; a file that is removed meanwhile is skipped."""
-    with suppress(FileNotFoundError, NotADirectoryError), os.scandir(directory) as there:
-        for entry in there:
+    """Yield the files below a directory, with ``above`` as prefix of names; files that disappear are skipped."""
+    with suppress(FileNotFoundError, NotADirectoryError), os.scandir(directory) as entries:
+        for entry in entries:
             if entry.name.startswith(atomic.TEMPORARY_PREFIX):
                 continue
             if entry.is_dir():

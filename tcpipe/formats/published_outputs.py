@@ -7,7 +7,7 @@
 
 A pointer is written after the files and never changed. The highest number counts, then the smallest digest; bytes whose
 sha256 does not begin with the digest in their name are no pointer. Files at a URL without a pointer, as a copy put them
-there, are read as they are.
+there, are read unchanged.
 """
 
 import re
@@ -125,7 +125,7 @@ def write_output(url: str, card: str) -> Iterator[Path]:
 
 @contextmanager
 def open_output(out: Location, card: str) -> Iterator[Path]:
-    """Yield the directory for an output: ``out`` itself or, for a URL, one whose files become its newest build."""
+    """Yield the directory for an output: ``out``, or, for a URL, a temporary one that becomes its newest build."""
     if not is_url(out):
         yield Path(out)
         return
@@ -169,7 +169,7 @@ def _find_card(place: Place, cards: Sequence[str]) -> FoundCard | None:
 
 
 def _iterate_pointers(place: Place, names: Iterable[str]) -> Iterator[_Pointer]:
-    """Yield the pointers among the names at a place, the one that counts first; damaged ones are skipped."""
+    """Yield the pointers among the names at a place, the valid one first; damaged ones are skipped."""
     found = [match for name in names if (match := _POINTER.fullmatch(name))]
     for match in sorted(found, key=lambda match: (-int(match[1]), match[2])):
         data = place.read(match[0])

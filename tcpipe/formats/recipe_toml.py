@@ -52,7 +52,7 @@ def load_recipe(path: Path | None) -> Recipe:
 
 
 def resolve_recipe(given: Recipe | Location | None) -> Recipe:
-    """Return a recipe: the one given, itself or by its path, else the one that rules here, as `find_recipe` says."""
+    """Return the given recipe, itself or by its path, else the one that `find_recipe` finds."""
     if isinstance(given, Recipe):
         return given
     return load_recipe(find_recipe(None if given is None else Path(given), Path.cwd()))
@@ -86,7 +86,7 @@ def _hash_values(values: Mapping[str, Json]) -> str:
 
 
 def read_key(recipe: Recipe | IngestSections, robot: str | None, *, definitions: str) -> str:
-    """Return the hash (hex) of what determines the streams of a log: read section, robot, given definitions."""
+    """Return the hash (hex) of all settings that determine the streams of a log: read section, robot, definitions."""
     own = {name: values for name in _OWN_TABLES if (values := getattr(recipe, name))}
     return digest({"read": recipe.read, "robot": robot, "definitions": definitions, **own})
 
@@ -132,7 +132,7 @@ def _iterate_key_lines(schema: Mapping[str, Any], name: str, value: Any, choices
 
 @cache
 def load_shipped_profiles() -> Profiles:
-    """Return what the package knows."""
+    """Return the profiles in the package."""
     known = Profiles({GENERIC: Robot()})
     for file in sorted(files("tcpipe.robots").iterdir(), key=lambda file: file.name):
         if file.name.endswith(".toml"):
@@ -141,7 +141,7 @@ def load_shipped_profiles() -> Profiles:
 
 
 def load_profiles(recipe: Recipe | IngestSections) -> Profiles:
-    """Return what a recipe knows, and beyond that the package."""
+    """Return the profiles of a recipe, and those of the package that it does not replace."""
     of_tables = [source for name, table in recipe.tables.items() if (source := table.make_power_source(name))]
     return Profiles(recipe.robots, [*recipe.power_sources, *of_tables]).before(load_shipped_profiles())
 

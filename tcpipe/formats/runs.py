@@ -1,4 +1,4 @@
-"""The record of one run: its JSON is the manifest, and what is asked of all runs at once is a part of it."""
+"""The record of one run: its JSON is the manifest, of which the summary for all runs is a part."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -48,7 +48,7 @@ class LogFailure:
     """A log that failed because of its content: the same call would fail again."""
 
     content: str
-    """The sha256 of the log; where nothing could be read, a hash of its path, sizes and times."""
+    """The sha256 of the log; if nothing is readable, a hash of its path, sizes and times."""
     log: tuple[str, ...]
     problems: tuple[str, ...]
     version: str
@@ -62,7 +62,7 @@ class Problem:
 
     finding: Finding
     content: str
-    """The sha256 of the log, or what else identifies the subject: a problem of other content is a new one."""
+    """The sha256 of the log, or another identity of the subject: with other content a problem counts as new."""
     log: tuple[str, ...] = omit(())
     run_id: str | None = omit()
 
@@ -85,7 +85,7 @@ def make_failure(content: str, log: tuple[str, ...]) -> Problem:
 
 @dataclass(frozen=True, slots=True)
 class Tags:
-    """The tags of a log, which hold under every recipe."""
+    """The tags of a log, which apply to every recipe."""
 
     log: str
     """Its sha256."""
@@ -167,7 +167,7 @@ class Call:
     message: str = ""
     """Why it failed, or which call did its work after it was killed."""
     counts: Mapping[str, int] = field(default_factory=dict)
-    """Logs by what became of them; or samples and runs."""
+    """Number of logs by result; or of samples and runs."""
     jobs: int = 1
     wall_s: float = 0.0
     cpu_s: float = 0.0
@@ -182,13 +182,13 @@ class Call:
 
 
 def find_lineage(log: tuple[str, ...]) -> str:
-    """Return what identifies the place of a log; a recording that is finished (``.active`` goes) stays where it was."""
+    """Return the identity of a log's location; it is the same after the recorder removes ``.active``."""
     return "\n".join(path.removesuffix(_UNFINISHED) for path in log)
 
 
 @dataclass(frozen=True, slots=True)
 class LogOrigin:
-    """Where the log of a run lay when it was ingested, and what identifies its content."""
+    """Location of a run's log when it was ingested, and the identity of its content."""
 
     paths: tuple[str, ...]
     sha256: str
@@ -235,7 +235,7 @@ class Recording:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunFacts:
-    """The facts of a run that are asked of all runs of a store at once; the index of a store holds them."""
+    """The facts of a run that commands need of all runs of a store; the store's index contains them."""
 
     run_id: str
     recipe_id: str
@@ -245,7 +245,7 @@ class RunFacts:
     ingest_key: str
     """Hash of the sections of the recipe that decide its tables."""
     read_key: str
-    """Hash of what decides its streams."""
+    """Hash of all settings that determine its streams."""
     robot: str
     robot_requested: str | None = None
     message_definitions: str = ""
@@ -330,7 +330,7 @@ class RunFacts:
 
 
 def find_problems(row: RunFacts) -> tuple[Problem, ...]:
-    """Return what is wrong with a run: damage of its log, or that it has no segments."""
+    """Return the problems of a run: damage of its log, or missing segments."""
     log = row.log
     return tuple(Problem(finding, log.sha256, log.paths, row.run_id) for finding in select_problems(row.findings))
 
@@ -361,7 +361,7 @@ class StreamInfo:
 
 
 def strip_repeated(run: Run) -> Run:
-    """Return a run as it is written: each finding once, without what other documents decide."""
+    """Return a run as it is stored: each finding once, without facts of other documents."""
     report = replace(run.info.report, findings=())
     return replace(run, info=replace(run.info, report=report), tags={}, superseded_by=None)
 

@@ -133,7 +133,7 @@ def read_streams(place: Place, row: RunFacts) -> Streams | None:
 
 @contextmanager
 def convert_run_errors(where: str, directory: Path) -> Iterator[None]:
-    """Tell what goes wrong in a working directory of the place for which it is."""
+    """Give errors in a working directory the path of the final place."""
     try:
         yield
     except StoreError as error:
@@ -156,7 +156,7 @@ class _LentTables(Mapping[str, pa.Table]):
         return read_table(self._files[role]).replace_schema_metadata(None)
 
     def __contains__(self, role: object) -> bool:
-        """Tell whether there is such a role; nothing is read for that."""
+        """Return whether there is such a role, without reading a table."""
         return role in self._held or role in self._files
 
     def __iter__(self) -> Iterator[str]:
@@ -211,7 +211,7 @@ def list_named_files(records: Iterable[RunFacts | StoredMap]) -> set[str]:
 
 
 def find_unnamed(payload: Mapping[str, Sequence[FileEntry]], named: Collection[str]) -> Iterator[Unnamed]:
-    """Yield what is not named: whole folders, and single files of folders in use."""
+    """Yield unreferenced payload: whole folders, and single files of used folders."""
     used = {name.partition("/")[0] for name in named}
     for blob, entries in payload.items():
         if blob not in used:

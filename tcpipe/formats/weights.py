@@ -12,7 +12,7 @@ from tcpipe.errors import ModelError
 from tcpipe.formats.atomic import write_atomic_file
 
 ArrayForm = tuple[str, tuple[int | str, ...]]
-"""Type and shape of an array; a name stands for any length, and for the same one wherever it stands."""
+"""Type and shape of an array; a name means any length, the same at all its occurrences."""
 
 
 def write_arrays(path: Path, arrays: NamedArrays) -> None:
@@ -22,7 +22,7 @@ def write_arrays(path: Path, arrays: NamedArrays) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, GenericArray]:
-    """Return what `write_arrays` wrote; `ModelError` where it is damaged or none of its kind."""
+    """Return the arrays of a file of `write_arrays`; `ModelError` if it is damaged or another kind of file."""
     try:
         _require_plain_arrays(path)
         with np.load(path, allow_pickle=False) as held:
@@ -60,7 +60,7 @@ def check_arrays(arrays: NamedArrays, forms: Mapping[str, ArrayForm]) -> None:
 
 
 def _find_wrong_form(found: Mapping[str, ArrayForm], forms: Mapping[str, ArrayForm]) -> str | None:
-    """Return in words the first array that is not as it is wanted; None where all are."""
+    """Return a description of the first array that differs from the expected one; None if all agree."""
     if missing := forms.keys() - found.keys():
         return f"{min(missing)} is missing"
     lengths: dict[str, int] = {}

@@ -256,7 +256,7 @@ class ShardedArray:
         return content
 
     def _index_span(self, shard_bytes: int) -> tuple[int, int]:
-        """Return offset and size of the table in a shard of so many bytes."""
+        """Return offset and size of the table in a shard of a given size [byte]."""
         size = 16 * math.prod(self.per_shard) + _CRC_BYTES
         return max(shard_bytes - size, 0), size
 
@@ -299,7 +299,7 @@ def _make_codec(name: str, configuration: Mapping[str, Any]) -> Any:
 
 
 def _decode(codec: Any, data: bytes, out: AnyArray) -> None:
-    """Fill ``out`` with what is encoded; `ValueError` where that is more or less."""
+    """Decode into ``out``; `ValueError` if the size differs."""
     size = int.from_bytes(data[4:8], "little") if isinstance(codec, numcodecs.Blosc) else _read_zstd_size(data)
     if size != out.nbytes:
         raise ValueError(f"it contains {size} bytes, expected {out.nbytes}")
@@ -307,7 +307,7 @@ def _decode(codec: Any, data: bytes, out: AnyArray) -> None:
 
 
 def _read_zstd_size(data: bytes) -> int:
-    """Return how many bytes a frame says that it holds (RFC 8878, 3.1.1); 0 where it does not say."""
+    """Return the size of the content that a frame states (RFC 8878, 3.1.1) [byte]; 0 if it states none."""
     if len(data) < 5:
         raise ValueError("it is truncated")
     flag, is_single, has_dictionary = data[4] >> 6, data[4] >> 5 & 1, data[4] & 3

@@ -62,7 +62,7 @@ def geodetic_from_ecef(ecef_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
 
 
 def ecef_from_enu_rotation(lon_deg: float, lat_deg: float) -> Floats:
-    """Return the rotation (3, 3) whose columns are east, north and up at a place, in earth-centred axes."""
+    """Return the rotation (3, 3) from local to earth-centred axes; its columns are east, north and up."""
     sl, cl = np.sin(np.radians(lon_deg)), np.cos(np.radians(lon_deg))
     sp, cp = np.sin(np.radians(lat_deg)), np.cos(np.radians(lat_deg))
     return np.array([[-sl, -sp * cl, cp * cl], [cl, -sp * sl, cp * sl], [0.0, cp, sp]])

@@ -18,7 +18,7 @@ from tcpipe.compiled import compile_kernel
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NS = 1e-9
 _PARTS = 8
-"""An interval is looked at in so many parts: 6 ms at 20 Hz."""
+"""Parts of an interval that are searched: 6 ms at 20 Hz."""
 
 
 def find_row_before(stamp_ns: Ints, at_ns: Ints) -> NDArray[np.intp]:

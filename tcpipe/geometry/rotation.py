@@ -24,7 +24,7 @@ def wrap_to_pi(angle_rad: ArrayLike) -> Floats:
 
     Returns
     -------
-    [rad], the same shape; what is not finite stays so.
+    [rad], the same shape; values that are not finite do not change.
     """
     angle = np.asarray(angle_rad, float)
     wrapped = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))

@@ -42,8 +42,7 @@ KIND_OF_BASELINE: Mapping[str, ModelKind] = {
 
 SPLITS = ("test", "unseen")
 
-_MOST_EQUAL = 1.005
-"""Ratio of RMSE up to which models are equal [1]: rounding changes it by less."""
+_MOST_EQUAL = 1.005  # ratio of RMSE up to which models are equal [1]: rounding changes it by less
 
 
 def compare_baselines(

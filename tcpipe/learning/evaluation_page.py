@@ -259,22 +259,19 @@ unseen."""
 
 
 _CALLED_QUANTITY = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}
-_MOST_DRAWN = 5_000
-"""Largest number of samples in a scatter plot; samples are in random order."""
-_WORST = 10
-"""Samples of each split in the table of the largest errors."""
+_MOST_DRAWN = 5_000  # largest number of samples in a scatter plot; samples are in random order
+_WORST = 10  # samples of each split in the table of the largest errors
 _SLOPE_EDGES_DEG = (-15.0, -10.0, -5.0, -2.0, 2.0, 5.0, 10.0, 15.0)
 """Between the ranges of slope along travel [deg]; the paper's robot climbs 22.5°."""
 _SLOPE_NAMES = (
     *("below -15°", "-15° to -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°"),
     *("2° to 5°", "5° to 10°", "10° to 15°", "above 15°"),
 )
-_WHOLE_JOULE = 10.0
-"""RMSE of E from which whole joules are printed [J], so that nine ranges of slope fit."""
+_WHOLE_JOULE = 10.0  # RMSE of E from which whole joules are printed [J], so that nine ranges of slope fit
 
 
 def draw_predictions(table: pa.Table, audit: str) -> PageSection:
-    """Return a point for each sample, E and T; ``audit`` says how far they are from training."""
+    """Return a point for each sample, E and T; ``audit`` gives their distance from training samples."""
     text = "Each point is a segment, coloured by class; on the line the prediction is exact. Point at one for its name."
     drawn = table.slice(0, _MOST_DRAWN)
     if drawn.num_rows < table.num_rows:

@@ -57,8 +57,7 @@ class TrainingTimes:
     samples: int = 0
 
 
-_SMALLEST = 1e-12
-"""Added under the root [1]; without it the loss has no gradient at a perfect prediction."""
+_SMALLEST = 1e-12  # added under the root [1]; without it the loss has no gradient at a perfect prediction
 
 
 def compute_loss_factors(loss: Loss, scale: Sequence[float]) -> Floats32:

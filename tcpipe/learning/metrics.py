@@ -81,8 +81,7 @@ def compute_errors(predicted: Floats, measured: Floats, least: float = 0.0, spre
     return Errors(len(difference), rmse, mape, int(large.sum()), *scores)
 
 
-_LEAST_STD = 1e-9
-"""Least standard deviation; labels that are all equal have none."""
+_LEAST_STD = 1e-9  # least standard deviation; labels that are all equal have none
 
 
 def _compute_scores(off: Floats, measured: Floats, spread: Spread) -> tuple[float, float, float]:
@@ -126,7 +125,7 @@ def compute_errors_by_class(
     predicted, measured : the same quantities, each of shape (N,).
     class_ids : terrain class of each sample, shape (N,).
     names : of the ids that occur.
-    spreads : what is stated of the predictions' errors, by quantity.
+    spreads : stated errors of the predictions, by quantity.
     """
 
     def compute_rows(quantity: str, rows: Mask) -> Errors:
@@ -138,7 +137,7 @@ def compute_errors_by_class(
 
 
 def _group_by_class(compute: Callable[[Mask], Errors], class_ids: Ints, names: Mapping[int, str]) -> dict[str, Errors]:
-    """Return what is computed of rows, by the name of each class that occurs, and of `ALL`."""
+    """Return the result of a function for the rows of each class, by its name, and for `ALL`."""
     rows = {name: class_ids == class_id for class_id, name in names.items()} | {ALL: np.ones(len(class_ids), bool)}
     return {name: compute(here) for name, here in rows.items() if here.any() or name == ALL}
 
@@ -161,7 +160,7 @@ def compute_label_floor(
 
 
 PATH_M = 30
-"""Length of the paths by whose sums a model is judged, in samples of about a metre."""
+"""Length of the paths whose sums are evaluated, in samples of about a metre."""
 
 
 def compute_path_error(predicted: Floats, measured: Floats, runs: GenericArray, start_ns: GenericArray) -> float:

@@ -48,8 +48,7 @@ class LayerRange:
         return np.asarray((np.abs(values - np.array(self.mean)) / np.array(self.std)).max(axis=1))
 
 
-_LEAST_SHARE = 1e-3
-"""Least variation of a band, as a share of its mean: rounding is not outside the training range."""
+_LEAST_SHARE = 1e-3  # least variation of a band, as a share of its mean: rounding is not outside the training range
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +112,7 @@ class ModelCard:
     label_energy: EnergyName = "total"
     """total or net: which power w is, and so which energy E."""
     label_includes: tuple[str, ...] = ()
-    """Loads besides the drives in the measured power, from the card of the dataset."""
+    """Loads other than the drives in the measured power, from the card of the dataset."""
     robot: str
     classes: tuple[TerrainClass, ...]
     training_range: TrainingRange

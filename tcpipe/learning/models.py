@@ -44,8 +44,7 @@ FILES = CARD, WEIGHTS, RESIDUALS, GROUND, HISTORY = (
 
 GROUND_COLUMNS = "lon_deg", "lat_deg"
 
-_SPEED_MARGIN_MPS = 0.01
-"""Largest distance of a speed from those of training [m/s], for rounding."""
+_SPEED_MARGIN_MPS = 0.01  # largest distance of a speed from those of training [m/s], for rounding
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,7 @@ class Model:
 
         A model of time alone gives power and velocity, too: its power is NaN.
         ``features`` are those of the N segments (`tcpipe.dataset.extra_features.read_extra_features` of a split).
-        Physics needs them; other models take what they were trained with, and their usual values where it is not given.
+        Physics needs them; other models use the features that they were trained with, and defaults for missing ones.
         """
         inputs = self.card.inputs
         wanted = (inputs.patch_px, inputs.patch_px, len(inputs.planes))

@@ -25,8 +25,7 @@ from tcpipe.errors import ModelError
 from tcpipe.formats.weights import check_arrays
 from tcpipe.learning.fitting import mean_loss
 
-_TOGETHER = 256
-"""Patches in one forward pass."""
+_TOGETHER = 256  # patches in one forward pass
 
 _TRUNCATED_STD = 0.87962566103423978
 """Standard deviation of a standard normal variable that is truncated at ±2; Keras's ``he_normal`` divides by it."""
@@ -39,7 +38,7 @@ class Normed(nn.Module):
         super().__init__()
         around = size // 2 if stride == 1 else 0
         self.convolution = nn.Conv2d(depth, filters, size, stride, around, bias=False)
-        # The momentum is the share of what is new; Keras gives that of the old, 0.9.
+        # Here, momentum is the weight of the new value; in Keras it is that of the old value, 0.9.
         self.norm = nn.BatchNorm2d(filters, eps=1e-5, momentum=0.1)
 
     def forward(self, images: Any) -> Any:
@@ -49,7 +48,7 @@ class Normed(nn.Module):
 
 
 class BasicBlock(nn.Module):
-    """Two convolutions, added to what came in, which is convolved 1 × 1 where its shape changes."""
+    """Two convolutions, added to the input, which is convolved 1 × 1 if its shape changes."""
 
     def __init__(self, depth: int, filters: int, stride: int) -> None:
         super().__init__()
@@ -79,7 +78,7 @@ class ResNet18(nn.Module):
     def forward(self, images: Any) -> Any:
         """Return the outputs."""
         values = functional.relu(self.stem(images))
-        values = functional.max_pool2d(_pad_images(values, 3, 2), 3, 2)  # zeros: nothing is less after a ReLU
+        values = functional.max_pool2d(_pad_images(values, 3, 2), 3, 2)  # zeros: the least value after a ReLU
         for name, block in self.named_children():
             values = block(values) if name.startswith("stage") else values
         return self.head(values.mean((2, 3)))
@@ -134,7 +133,7 @@ def make_resnet18(depth: int, outputs: int, width: int, *, seed: int, start: Seq
 
 
 def find_device() -> Any:
-    """Return what networks run on."""
+    """Return the device of networks."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
@@ -155,11 +154,9 @@ def _pad_images(images: Any, size: int, stride: int) -> Any:
     return functional.pad(images, [part for pixels in missing for part in (pixels // 2, pixels - pixels // 2)])
 
 
-_DIGEST_BYTES = 32
-"""Size of the SHA-256 before a packed state [byte]."""
+_DIGEST_BYTES = 32  # size of the SHA-256 before a packed state [byte]
 
-_EPSILON = 1e-7
-"""Epsilon of Adam [1]: that of Keras; torch's default is 1e-8."""
+_EPSILON = 1e-7  # epsilon of Adam [1]: that of Keras; torch's default is 1e-8
 
 
 class Trainer:

@@ -42,14 +42,12 @@ BLOCK, _MOST_WIDTH, _MOST_INPUTS = 16, 512, 1024
 """Channels combined by CPU convolutions: with fewer, oneDNN, which PyTorch uses there, writes beyond its memory in the
 gradient of a 1 × 1 convolution with a stride (its issue 6035); it crashed with 4 and 8 filters."""
 
-_SLOWER = 0.1
-"""Factor of the learning rate when the loss stops falling."""
+_SLOWER = 0.1  # factor of the learning rate when the loss stops falling
 
 _SECONDS_BETWEEN = 60.0
 """Training that a crash loses at most, beyond an epoch [s]; an interruption loses only the epoch in which it occurs."""
 
-_LAST = 0.8
-"""Share of the maximum of epochs after which the rate is smaller in any case."""
+_LAST = 0.8  # share of the maximum of epochs after which the rate is smaller in any case
 
 
 def check_trainable(depth: int, outputs: int, width: int) -> None:
@@ -205,7 +203,7 @@ class NetworkModel(Predictor):
 
 
 def _make_trainer(fit: Samples) -> tuple[Trainer, str]:
-    """Return an untrained network with its optimiser, and what it runs on."""
+    """Return an untrained network with its optimiser, and its device."""
     config, scale = fit.config, fit.inputs.scale
     start = fit.labels.astype(np.float32).mean(axis=0) / scale
     sizes = fit.inputs.depth, len(fit.inputs.outputs), config.width

@@ -71,7 +71,7 @@ def _make_kind(found: Any, source: str) -> type[Predictor]:
 
 @contextmanager
 def report_errors(own: OwnKind | str | None) -> Iterator[None]:
-    """Turn what the user's code raises into a `ModelError` that says where; None: no such code runs."""
+    """Convert exceptions of the user's code into `ModelError` with the location; None: no such code runs."""
     source = own.source if isinstance(own, OwnKind) else own
     try:
         yield

@@ -96,7 +96,7 @@ def fit_physics_model(extra_features: ExtraFeatures, labels: Floats, *, idle_wat
     ----------
     extra_features : of N samples; without any turn it has no term for turning.
     labels : power [W] and velocity [m/s], finite, shape (N, 2).
-    idle_watt : what the robot was seen to draw while it stood; None where it was not.
+    idle_watt : measured idle power; None if the robot was never stationary.
     """
     if labels.shape[1] < 2:
         raise ModelError("a model of physics needs the label energy, which the dataset does not have")
@@ -139,8 +139,7 @@ def _collect_by_class(found: Physics, term: str) -> Floats:
     return np.array([own.get(str(class_id), rest) for class_id in range(_CLASSES)])
 
 
-_KNOTS = 1 / 3, 2 / 3
-"""Quantiles of the slopes where a curve bends."""
+_KNOTS = 1 / 3, 2 / 3  # quantiles of the slopes where a curve bends
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,10 +156,10 @@ class Curves:
 
     def predict(self, slope_rad: Floats, class_id: Ints) -> Floats:
         """Return outputs, shape (N, outputs), of segments of one metre by slope and class."""
-        made = _evaluate_functions(self.knots_rad, slope_rad)
-        out = made @ self.pooled
+        design = _evaluate_functions(self.knots_rad, slope_rad)
+        out = design @ self.pooled
         for known, numbers in zip(self.class_id.tolist(), self.own, strict=True):
-            out[class_id == known] = made[class_id == known] @ numbers
+            out[class_id == known] = design[class_id == known] @ numbers
         return out
 
     def arrays(self) -> dict[str, GenericArray]:
@@ -173,7 +172,7 @@ _ARRAYS, _STORED = ("knots_rad", "pooled", "class_id", "own"), "curve_"
 
 
 def list_curve_arrays(outputs: int) -> dict[str, ArrayForm]:
-    """Return types and shapes of the arrays of curves of so many outputs."""
+    """Return types and shapes of the arrays of curves with this number of outputs."""
     forms: dict[str, ArrayForm] = {
         "knots_rad": ("float64", ("knots",)),
         "pooled": ("float64", ("functions", outputs)),
@@ -234,23 +233,23 @@ class MeanModel(CurveModel):
 
 
 def fit_curves(slope_rad: Floats, class_id: Ints, labels: Floats, *, quantiles: Sequence[float] = _KNOTS) -> Curves:
-    """Fit a curve of every class.
+    """Fit one curve for each class.
 
     Parameters
     ----------
     slope_rad, class_id : of the samples, finite, shape (N,), N at least 1.
     labels : finite, shape (N, outputs).
-    quantiles : of the slopes, where the curves bend; none: a mean of each class.
+    quantiles : quantiles of the slopes at which the curves bend; none: one mean for each class.
     """
     knots = np.unique(np.quantile(slope_rad, quantiles)) if quantiles else np.empty(0)
-    made = _evaluate_functions(knots, slope_rad)
-    pooled = np.asarray(np.linalg.lstsq(made, labels, rcond=None)[0], float)
-    drawn = made.T @ made * (made.shape[1] / len(made))
+    design = _evaluate_functions(knots, slope_rad)
+    pooled = np.asarray(np.linalg.lstsq(design, labels, rcond=None)[0], float)
+    prior = design.T @ design * (design.shape[1] / len(design))
     classes = np.unique(class_id[class_id > 0])
     own = np.empty((len(classes), *pooled.shape))
     for at, known in enumerate(classes):
-        mine, off = made[class_id == known], (labels - made @ pooled)[class_id == known]
-        own[at] = pooled + np.linalg.pinv(mine.T @ mine + drawn, hermitian=True) @ (mine.T @ off)
+        own_design, residual = design[class_id == known], (labels - design @ pooled)[class_id == known]
+        own[at] = pooled + np.linalg.pinv(own_design.T @ own_design + prior, hermitian=True) @ (own_design.T @ residual)
     return Curves(knots, pooled, classes, own)
 
 

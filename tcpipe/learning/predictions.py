@@ -44,7 +44,7 @@ class Measured:
 
 
 def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
-    """Return what was measured, with the names of classes by id; samples without a label are left out."""
+    """Return the measured labels, with the names of classes by id; samples without a label are left out."""
     energy, *power_column, velocity_column = split.energy, *split.label_columns
     columns = {"v": (velocity_column, "velocity_std_mps"), "T": ("duration_s", "duration_std_s")}
     if power_column:
@@ -171,7 +171,7 @@ _KEYS = (
 
 
 def make_column_name(quantity: str, part: str = "") -> str:
-    """Return the name of the column that holds a part of w, v, T or E, as ``energy_predicted_low_joule``."""
+    """Return the column name of a predicted value of w, v, T or E, such as ``energy_predicted_low_joule``."""
     return "_".join(name for name in (CALLED[quantity], part, _SUFFIX[quantity]) if name)
 
 

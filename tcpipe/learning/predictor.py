@@ -54,7 +54,7 @@ class Inputs:
     class_count: int
     """Largest class id of the table by which the terrain channel is scaled."""
     extra_features: tuple[ExtraFeature, ...]
-    """Features besides slope and class that are known, with their distribution over the training samples."""
+    """Known features other than slope and class, with their distribution over the training samples."""
     outputs: tuple[str, ...]
     """Columns: power and velocity, or velocity alone (a dataset without power)."""
     scale: tuple[float, ...]
@@ -122,7 +122,7 @@ class Samples:
 
     @property
     def patches(self) -> Patches:
-        """All patches at once, shape (N, px, px, channels)."""
+        """All patches in one array, shape (N, px, px, channels)."""
         return self.split.patches
 
     @cached_property
@@ -255,8 +255,7 @@ def predict_samples(predictor: Predictor, samples: Samples) -> Prediction:
     return Prediction.concatenate([Prediction.without_covariance(nothing), *parts])
 
 
-_ROUNDING = 1e-6
-"""Negative share of the largest eigenvalue up to which a covariance counts as one."""
+_ROUNDING = 1e-6  # negative share of the largest eigenvalue up to which a covariance counts as one
 
 
 def ask_predictor(
@@ -298,7 +297,7 @@ def find_held_out(held_out: Prediction) -> Mask:
 
 
 def compute_held_loss(held: Samples, predicted: Labels) -> float:
-    """Return the loss of predictions of held-out samples, as the options say."""
+    """Return the loss of predictions of held-out samples, by the loss of the options."""
     scale = np.array(held.inputs.scale, np.float32)
     labels, predicted = (values.astype(np.float32) / scale for values in (held.labels, predicted))
     factors = compute_loss_factors(held.config.loss, held.inputs.scale)

@@ -49,7 +49,7 @@ def compute_patch_features(patches: Patches, *, channels: Sequence[str], class_c
     Parameters
     ----------
     patches : values in [0, 1]; travel is along the columns.
-    channels : what the last axis holds: `Inputs.planes`.
+    channels : channels of the last axis: `Inputs.planes`.
     class_count : largest class id of the table that the terrain channel is scaled by.
     patch_m : side of a patch [m].
     """
@@ -139,7 +139,7 @@ _END = "end of trees\n"
 
 
 def clean_trees(text: str, features: int) -> str:
-    """Return a LightGBM text model with only what predictions need; `ModelError` for an invalid index."""
+    """Return a LightGBM text model with only the lines that predictions need; `ModelError` for an invalid index."""
     body = text[text.find("Tree=") : text.rfind(_END)]
     found, parts = list(_TREE.finditer(body)), list[str]()
     if not found or sum(len(match[0]) for match in found) != len(body):
@@ -301,7 +301,7 @@ def fit_table(
     features : finite, shape (N, features): those of the inputs' planes, then any others.
     labels : shape (N, outputs).
     folds : of each sample, shape (N,); at least two.
-    inputs, config : what the features are of, and settings of LightGBM.
+    inputs, config : inputs of the features, and settings of LightGBM.
     """
     slope_rad, class_id = find_slope_and_class(features, inputs.planes, inputs.class_count)
     curve_labels = np.empty_like(labels)

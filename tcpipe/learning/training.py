@@ -126,7 +126,7 @@ def _compute_losses(samples: Samples, predicted: Floats) -> Floats:
 
 
 def is_within_error(difference: Floats, clusters: Ints) -> bool:
-    """Return whether the mean of differences is no more than its standard error, whose clusters err alike."""
+    """Return whether the mean of differences is at most its standard error, computed over clusters."""
     sums = np.bincount(clusters, difference - difference.mean())
     count = int(np.unique(clusters).size)
     return bool(difference.mean() <= np.sqrt(np.square(sums).sum() * count / max(count - 1, 1)) / difference.size)
@@ -144,7 +144,7 @@ def train(
 
     Parameters
     ----------
-    dataset : what ``tcpipe build-dataset`` wrote.
+    dataset : output of ``tcpipe build-dataset``.
     out : a new folder, or one with only a model, which is replaced unless it is complete and of the same dataset and
         options; or a URL in a bucket, where it becomes the newest build. ``<out>.KEY.checkpoint`` beside the folder, or
         in this one for a URL, keeps the state, so that a training resumes; KEY depends on dataset and options.
@@ -287,7 +287,7 @@ def _find_extra_features(used: Split, wanted: Sequence[str] | None, data: Datase
 
 
 def find_training_range(split: Split) -> TrainingRange:
-    """Return classes and ranges of what a split holds."""
+    """Return the classes and value ranges of a split."""
     pixel_classes: set[int] = set()
     reliefs_m: list[float] = []
     means: dict[str, list[Floats]] = {}
@@ -387,9 +387,10 @@ def _find_middles(split: Split) -> Floats:
 
 
 def _predict_near(kind: type[Predictor], samples: Samples, within_m: float) -> Prediction:
-    """Return predictions by models of other runs of the samples on ground that these drove, too; NaN for all others.
+    """Predict samples near ground of other runs by models trained without their run; other samples are NaN.
 
-    They show the errors of a new drive over ground of training. A network, and few runs, have none.
+    This shows the errors of a new drive over known ground. A network has no such predictions, and neither have few
+    runs.
     """
     out = Prediction.without_covariance(np.full(samples.labels.shape, np.nan))
     runs, middles = np.unique(samples.split.column("run_id"), return_inverse=True)[1], _find_middles(samples.split)
@@ -411,7 +412,7 @@ def _select_used(samples: Samples, fitted: Fitted) -> Split:
 
 
 def _make_residuals_table(samples: Samples, fitted: Fitted, near: Prediction) -> pa.Table:
-    """Return labels and predictions of what was held out, one row a sample."""
+    """Return labels and predictions of held-out samples, one row per sample."""
     held_out, is_held = fitted.held_out, find_held_out(fitted.held_out)
 
     held, said, labels = samples.split.take(is_held), held_out.take(is_held), samples.labels[is_held]

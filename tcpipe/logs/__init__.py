@@ -1,1 +1,1 @@
-"""Roles, topics, message meanings, clocks and placements: what a log says, as arrays."""
+"""Roles, topics, meaning of messages, clocks and extrinsics: the content of a log as arrays."""

@@ -60,7 +60,7 @@ class RoleMessages:
 
 
 def make_role_messages(log: Autopilot) -> tuple[list[RoleMessages], list[Finding]]:
-    """Return what roles can use, and findings: messages that lack fields, heights with another zero.
+    """Return the topics that roles can use, and findings: messages that lack fields, heights with another zero.
 
     Of the names of a source the first counts that there is, and of its instances the first; batteries count all.
     """
@@ -129,7 +129,7 @@ def find_utc_offset_us(log: Autopilot) -> int:
 _GPS_TIME = (("GWk", "Week"), ("GMS", "TimeMS"))
 _GPS_BEGAN_MS, _WEEK_MS = 315_964_800_000, 7 * 86_400_000
 _FIRST_US, LATEST_US = 1_100_000_000 * 10**6, 4_000_000_000 * 10**6
-"""Receivers count from their own epoch until they know the time; no log is from before 2004 or after 2096."""
+"""First and last valid time [s]: receivers without time count from their own epoch."""
 
 
 _RECEIVERS = "vehicle_gps_position sensor_gps GPS"
@@ -293,7 +293,7 @@ _TOPICS = {
     "battery": ("power", ""),
     "command": ("command", ""),
 }
-"""Role and frame of what messages become, by the last part of its topic."""
+"""Role and frame of converted messages, by the last part of their topic."""
 _SOURCES: dict[str, dict[str, tuple[str, _Convert]]] = {
     "ulog": {
         "fix": (_RECEIVERS, _convert_px4_fix),

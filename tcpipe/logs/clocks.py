@@ -1,4 +1,4 @@
-"""Clocks: which stamp of a message rules, where the clock steps, and what order the messages were measured in.
+"""Clocks: which stamp of a message is used, where the clock steps, and the order of measurement.
 
 Every message has a log time (when the recorder received it); most have a header stamp (when it was measured). The
 header's rules where it is set and follows the log time, within 10 s, up to a constant offset; otherwise log time; topic
@@ -153,7 +153,7 @@ def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = F
 def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int, int, float]]:
     """Return log times [ns] and sizes [s] of backward steps of a host's clock, where most topics double their messages.
 
-    A log is in order of log time: messages of before and after lie between each other there.
+    A log is in order of log time: messages from before and after the step are mixed there.
     """
     used = [times for times in topics.values() if len(times.log_time_ns)]
     if not used:
@@ -178,7 +178,7 @@ def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int
     found = []
     for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
         step_s = float(excess_s[min(end + 1, size)] - excess_s[max(begin - 1, 0)])
-        # A driver that catches up sends what it did not send before: there is no more than usual in a longer time.
+        # A driver that catches up sends delayed messages: over a longer time their number is normal.
         around_s = float(excess_s[min(2 * end - begin + 2, size)] - excess_s[max(2 * begin - end - 2, 0)])
         if end - begin > 1 and around_s > _MOSTLY * step_s:
             found.append((zero + (begin - 1) * STEP_NS, zero + (end + 1) * STEP_NS, step_s))
@@ -225,7 +225,7 @@ def _settle_steps(topics: Mapping[str, TopicTimes], of_host: Sequence[ClockStep]
     """Return each topic's timeline, and the steps of single clocks beside those of the host's."""
     steps_of = {name: _find_steps(times) for name, times in topics.items()}
     reasons = {name: _find_header_problem(times, steps_of[name]) for name, times in topics.items()}
-    # A header that does not rule has no say about the others' clock either.
+    # An unused header is also not used to judge the clock of the others.
     trusted = {name: steps for name, steps in steps_of.items() if reasons[name] is None}
     steps = _find_common_steps({name: topics[name].log_time_ns for name in topics}, trusted)
     steps += [
@@ -441,7 +441,7 @@ def _compute_repeated_share(times: TopicTimes) -> float:
 
 
 def _find_leaps(times: TopicTimes, known: Mask) -> Mask:
-    """Whether single stamps lie more than 1 s ahead of their neighbours': nothing is received before it is measured."""
+    """Whether single stamps are more than 1 s after their neighbours: no message is received before its measurement."""
     leaps = np.zeros(len(known), bool)
     rows = np.flatnonzero(known)
     if times.header_ns is None or len(rows) < _NEIGHBOURS:
@@ -469,7 +469,7 @@ def _find_reference_offset(drafts: Mapping[str, _Draft], epoch: int) -> int:
 
 
 def _find_clock_shifts(times: TopicTimes, draft: _Draft, reference: Sequence[int]) -> list[int]:
-    """Return what brings a topic to the clock of the others [ns], by epoch."""
+    """Return the correction of a topic to the clock of the others [ns], by epoch."""
     apart = [target - draft.offset_ns.get(epoch, 0) for epoch, target in enumerate(reference)]
     return [move if abs(move) > APART_NS and times.prefer != "header" else 0 for move in apart]
 
@@ -507,7 +507,7 @@ def _make_timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> To
 
 
 def _compute_lateness(stamp_ns: Ints, epoch: Ints, usable: Mask) -> Ints:
-    """Return how far each row lies before the latest stamp that came earlier in its epoch [ns], 0 where it does not."""
+    """Return how far each row is before the latest earlier stamp of its epoch [ns]; 0 if it is not before it."""
     late = np.zeros(len(stamp_ns), np.int64)
     for e in np.unique(epoch):
         rows = np.flatnonzero((epoch == e) & usable)

@@ -49,7 +49,7 @@ Read = Callable[[str, int | None], Floats]
 
 FORM = 'a column, or numbers and columns joined by + - * / ( ), as "(velL + velR) / 2"; other names in backquotes, as "`Power (w)` * 2"'
 _LONGEST = 300
-"""Characters: nothing that is nested deeper than the parser goes."""
+"""Longest expression [characters]: it cannot nest deeper than the parser allows."""
 _QUOTED = re.compile(r"`([^`]*)`")
 _MARK = "quoted_column_"
 _OPERATORS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide}
@@ -68,7 +68,7 @@ class Expression:
 
     @property
     def column(self) -> str | None:
-        """The column's name where it is one column as it stands."""
+        """Name of the column, if the expression is one column."""
         is_one = isinstance(self.tree, ast.Name | ast.Attribute | ast.Subscript)
         return self.operands()[0][0] if is_one else None
 
@@ -85,7 +85,7 @@ class Expression:
 
     def evaluate(self, read: Read) -> Floats:
         """Return the values, shape (N,), or () of a constant."""
-        with np.errstate(all="ignore"):  # what is not finite is counted where the values are used
+        with np.errstate(all="ignore"):  # users of the values count those that are not finite
             return self._evaluate(self.tree, read)
 
     def _evaluate(self, node: ast.expr, read: Read) -> Floats:
@@ -144,7 +144,7 @@ m/s mps m_s m_per_s meters_per_sec meters_per_second; cm/s cmps; mm/s mmps; km/h
 rad/s radps rads rad_s; deg/s degps degs dps deg_s °/s grad/s; rpm u/min; m/s2 m/s^2 m/s² m/s/s mps2 ms2; g; mg; V volt volts;
 mV millivolt millivolts; A amp amps ampere amperes; mA milliamp milliamps; W watt watts; mW; kW; J joule joules; kJ; Wh; mWh; kWh;
 s sec secs second seconds; ms msec milliseconds; us µs μs usec microseconds; ns nsec nanoseconds"""
-"""Units, and what else they are called in the name of a column."""
+"""Units, and their other spellings in column names."""
 _UNIT_OF = {name.lower(): names[0] for names in map(str.split, _UNIT_NAMES.split(";")) for name in names}
 _SUFFIX = re.compile(
     r"(.*?[^_ .\-])[_ .\-]++(" + "|".join(sorted(map(re.escape, _UNIT_OF), key=len, reverse=True)) + ")"

@@ -1,4 +1,4 @@
-"""Where sensors sit: chains of static transforms from a sensor's frame to base_link.
+"""Extrinsics of sensors: chains of static transforms from a sensor's frame to base_link.
 
 Conventions: REP-105 (base_link; base_footprint is its projection on the ground), tf2_msgs/TFMessage (``transform`` is
 parent_from_child). A transform counts as static when all its messages agree, so that a latched /tf of ROS 1 serves as
@@ -45,7 +45,7 @@ Tree = dict[str, dict[str, Pose]]
 
 
 def build_static_tree(transforms: Sequence[Transforms]) -> Tree:
-    """Return the tree of transforms that never change; what is not finite or has no rotation is left out."""
+    """Return the tree of transforms that never change; invalid transforms are left out."""
     first: dict[tuple[str, str], Pose] = {}
     moving: set[tuple[str, str]] = set()
     for logged in transforms:

@@ -45,7 +45,7 @@ def _map_vector(name: str, message: str, unit: str, *, needed: str = "") -> dict
 
 
 def _map_std(message: str, names: Sequence[str], size: int, unit: str = "m") -> dict[str, MappedField]:
-    """Return the deviations of a vector, the first three of the diagonal of a covariance of so many rows."""
+    """Return the standard deviations of a vector, the first three of the diagonal of a covariance matrix."""
     return {f"{name}_std": MappedField(message, unit, std_of=row * (size + 1)) for row, name in enumerate(names)}
 
 
@@ -124,7 +124,7 @@ _LEAPS = ((1_341_100_800, 16), (1_435_708_800, 17), (1_483_228_800, 18))
 def find_mapping_problems(
     where: str, role: str | None, columns: Mapping[str, str], units: Mapping[str, str]
 ) -> Iterator[str]:
-    """Yield what is wrong with a mapping, whatever it is mapped to."""
+    """Yield the problems of a mapping that do not depend on its role."""
     if role not in MAPPED:
         yield f"{where}: role is {role!r}; expected one of {', '.join(MAPPED)}"
         return
@@ -159,9 +159,9 @@ class FieldSource:
 def read_fields(
     where: str, role: str, columns: Mapping[str, str], units: Mapping[str, str] | None, known: Collection[str]
 ) -> dict[str, FieldSource] | list[str]:
-    """Return by field what the recipe makes it of, or every problem.
+    """Return the source of each field by the recipe, or all problems.
 
-    ``known`` are the columns that there are. The unit of a column alone is what its name ends with, where ``units``
+    ``known`` are the existing columns. The unit of a column alone is what its name ends with, where ``units``
     states none; that of an expression has to be stated where its columns have another one than the field. Where a
     recipe cannot state units (None), an expression converts.
     """
@@ -203,7 +203,7 @@ def find_other_unit(expression: Expression, unit: str) -> str | None:
 
 
 def _choose_factor(unit: str, expression: Expression, name: str, units: Mapping[str, str] | None) -> float | str:
-    """Return what one of a column's unit is in a field's, or what is unclear about that."""
+    """Return the factor from a column's unit to a field's, or the reason why it is unclear."""
     column, stated = expression.column, units.get(name) if units else None
     if units is not None and stated is None and column is None and (other := find_other_unit(expression, unit)):
         return f"its columns are in {other}; state the unit of the expression under units: {', '.join(UNITS[unit])}"
@@ -222,14 +222,14 @@ def _choose_factor(unit: str, expression: Expression, name: str, units: Mapping[
 
 
 _CLEARLY_A_UNIT = 2
-"""Characters: what is shorter at the end of a name may be something else."""
+"""Shortest unit at the end of a name [characters]: shorter ones may have another meaning."""
 
 
 def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, AnyArray]:
     """Return the fields of the message that a role usually has, by dotted name, from those that are mapped.
 
-    What is not mapped is what the message has for unknown: no orientation, no covariance, no altitude (NaN), a fix,
-    zero elsewhere. ``values`` are by short name, in the units of `MAPPED`, shape (rows,).
+    Fields that are not mapped have the message's value for unknown: no orientation, no covariance, no altitude (NaN), a
+    fix, zero elsewhere. ``values`` are by short name, in the units of `MAPPED`, shape (rows,).
     """
     zero = np.zeros(rows)
     made: dict[str, AnyArray] = {}
@@ -306,7 +306,7 @@ def utc_from_gps_ns(stamp_ns: Ints) -> Ints:
 def make_mapped_message(role: str, columns: Columns, fields: Mapping[str, str]) -> dict[str, AnyArray] | list[str]:
     """Return a custom message's columns as those of the role's usual message, or the problems of the mapping.
 
-    ``fields`` are by short name what each is taken from: ``pvt.lat``, ``accel[0]``, ``lat * 1e-7``.
+    ``fields`` are the sources by short name: ``pvt.lat``, ``accel[0]``, ``lat * 1e-7``.
     """
     where = f"recipe read.fields.{role}"
     problems = list(find_mapping_problems(where, role, fields, {}))
@@ -407,7 +407,7 @@ _OF_GNSS = re.compile(r"gps|gnss|gvel|sog|over_?ground")
 
 
 def match_table_roles(file: str, names: Sequence[str]) -> dict[str, tuple[dict[str, str], str]]:
-    """Return by role the column or expression of each field in a table, and what its names leave open.
+    """Return by role the column or expression of each field in a table, and the points that its names leave open.
 
     A speed or a position beside fixes was probably computed from them, unless another column is the receiver's speed.
     """

@@ -84,7 +84,7 @@ def read_messages(
 
 
 _IMPOSSIBLE = 1e9
-"""No position, velocity or acceleration in SI units is larger; squares of what is overflow."""
+"""Largest position, velocity or acceleration in SI units; squares of larger values overflow."""
 
 
 def _mask_impossible(name: str, values: AnyArray) -> AnyArray:
@@ -98,7 +98,7 @@ def _mask_impossible(name: str, values: AnyArray) -> AnyArray:
 def count_frames(columns: Columns, type_name: str) -> dict[str, int]:
     """Return the frames of a topic's measurements with their counts, most frequent first; leading slashes are removed.
 
-    A pose names only the frame it is in, not whose pose it is: none.
+    A pose names only its reference frame, not the frame of its sensor, so the latter is "".
     """
     name = "child_frame_id" if type_name == roles.ODOMETRY else "header.frame_id"
     if name not in columns or type_name in (roles.POSE_STAMPED, roles.POSE_WITH_COVARIANCE_STAMPED):
@@ -128,7 +128,7 @@ def _select_rows(columns: Columns, values: Arrays, drops: Mapping[str, Mask], **
             dropped[reason] = count
         keep &= ~mask
     row = np.flatnonzero(keep)
-    every = slice(None) if row.size == keep.size else row  # nothing is copied where every row is used
+    every = slice(None) if row.size == keep.size else row  # no copy if all rows are used
     stamps = read_header_ns(columns)
     return Readings(
         row,
@@ -238,7 +238,7 @@ def _read_nav_sat_fix(columns: Columns) -> Readings:
 def _read_altitude(alt: Floats, fixed: Mask) -> tuple[Floats, Mask]:
     """Return heights, the median of the known ones where a height is missing, and the rows of these.
 
-    NaN is sensor_msgs/NavSatFix's word for it; a receiver's own digits never stand still, so one constant is a word for
+    NaN is sensor_msgs/NavSatFix's word for it; measured digits always change, so one constant means
     it too.
     """
     unknown = ~np.isfinite(alt)
@@ -404,7 +404,7 @@ def _read_imu(columns: Columns) -> Readings:
     force = _read_vector(columns, "linear_acceleration")
     quat, bad = _read_orientation(columns, "orientation")
     absent = _is_absent(columns, "orientation_covariance")
-    # A driver without a filter fills in one constant orientation; a sensor's own digits never stand still.
+    # A driver without a filter sends one constant orientation; measured digits always change.
     constant = len(quat) > 10 and not absent.any() and bool(np.all(quat == quat[0]))
     quat[absent | constant] = np.nan
     variances = {

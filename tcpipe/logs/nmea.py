@@ -121,7 +121,7 @@ def _parse_rmc(parts: list[str]) -> tuple[float, ...]:
 
 
 def _parse_vtg(parts: list[str]) -> tuple[float, ...]:
-    """Return what `_parse_rmc` does; there is no time."""
+    """Return the same as `_parse_rmc`, without time."""
     parts = _strip_and_pad(parts)
     speed = _parse_number(parts[5]) * KNOT_MPS if parts[5] else _parse_number(parts[7]) / 3.6
     return -1, speed, _parse_number(parts[1]), _STATUS_OF_MODE.get(parts[9], -1)
@@ -133,7 +133,7 @@ def _strip_and_pad(parts: list[str]) -> list[str]:
 
 
 def _parse_number(text: str) -> float:
-    """Return a speed or a course, NaN for an empty field; `ValueError` for what neither can be."""
+    """Return a speed or a course, NaN for an empty field; `ValueError` for impossible values."""
     value = float(text) if text else np.nan
     if abs(value) > _VAST:
         raise ValueError(text)

@@ -46,7 +46,7 @@ class _Named:
     quantity: str
     scale: float
     core: tuple[str, ...]
-    """Words that say neither quantity nor side."""
+    """Words that describe neither quantity nor side."""
     side: tuple[str, ...]
 
 

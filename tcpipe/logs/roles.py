@@ -80,11 +80,11 @@ class PlayedRole:
 
 @dataclass(frozen=True, slots=True)
 class RoleAssignment:
-    """Who plays what.
+    """Topics used as each role.
 
-    ``left_out`` says why a topic plays no role though its type could; ``problems`` are the plain lines of what the user
-    has to decide; ``findings`` are the roles that are missing and the topics that are not used; ``transforms`` are the
-    topics that may place sensors, static ones first.
+    ``left_out`` gives the reason why a topic of a fitting type is not used; ``problems`` are the plain lines of what
+    the user has to decide; ``findings`` are the roles that are missing and the topics that are not used; ``transforms``
+    are the topics that may place sensors, static ones first.
     """
 
     robot: str
@@ -232,7 +232,7 @@ def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_sources: Co
 
 
 def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> None:
-    """Use the pose of another program if its name shows it, it is the only one, and nothing else measures positions."""
+    """Use another program's pose if its name shows that, it is the only one, and no other topic measures positions."""
     best = [] if taken else _select_best("pose", candidates) if candidates else []
     for _, why, topic in candidates:
         if [topic] == [other for _, other in best]:
@@ -358,13 +358,13 @@ def _find_role_word(pattern: re.Pattern[str], name: str) -> str | None:
 
 
 Ranked = list[tuple[tuple[int, ...], str, Topic]]
-"""Candidates with their rank (smaller is better) and what speaks for them."""
+"""Candidates with their rank (smaller is better) and the reason for it."""
 
 
 def _iterate_candidates(
     decided: _Decisions, topics: Sequence[Topic], settled: Mapping[str, str]
 ) -> Iterable[tuple[str, Ranked]]:
-    """Yield each role with its ranked candidates; what can be no candidate is left out with its reason."""
+    """Yield each role with its ranked candidates; topics that cannot be candidates are left out with the reason."""
     found: dict[str, Ranked] = {role: [] for role in ROLE_TYPES}
     bare = [topic for topic in topics if topic.type_name in FLOAT_TYPES]
     for topic in topics:

@@ -28,7 +28,7 @@ class Topic:
 
     ``type_name`` is ``package/msg/Name`` for ROS 1 and ROS 2 alike; ``encoding`` is ``cdr``, ``ros1``, or what else the
     log names; ``definition`` is the definition text in the log ("" where it has none), of the language
-    ``schema_encoding``; ``problem`` says why the topic cannot be read.
+    ``schema_encoding``; ``problem`` is the reason why the topic cannot be read.
     """
 
     name: str
@@ -72,11 +72,11 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A damaged place of a log, and what it cost where that is known.
+    """A damaged part of a log, and its known losses.
 
     ``cause`` is a code in the catalogue of findings, ``file`` of a directory its name and that of the file, ``offset``
-    [byte] where in the file, ``places`` how many are counted together, ``reason`` what the template of the cause needs
-    beside numbers.
+    [byte] where in the file, ``places`` the number of damaged parts counted together, ``reason`` what the template of
+    the cause needs beside numbers.
     """
 
     cause: str
@@ -168,7 +168,7 @@ def format_topic_names(topics: Sequence[Topic]) -> str:
 
 
 def list_undecodable(topics: Iterable[Topic]) -> Iterator[str]:
-    """Yield one line of the topics that hold data that cannot be decoded, by the reason; none where all can be."""
+    """Yield one line for each reason why topics cannot be decoded; none if all can."""
     by_reason: dict[str, list[Topic]] = {}
     for topic in topics:
         if topic.problem is not None and topic.message_count != 0:
@@ -318,7 +318,7 @@ _PLACES = frozenset({"gnss", "wheel_odometry"})
 
 
 def find_robot_namespaces(candidates: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
-    """Return the roles that could be played in each robot's namespace, or nothing where one robot explains the topics.
+    """Return the possible roles in each robot's namespace, or {} if one robot explains the topics.
 
     Two namespaces are two robots when three roles or more, GNSS or wheels among them, could be played in either. A
     camera that brings an IMU and an odometry of its own, or a controller that takes commands and gives odometry, is no

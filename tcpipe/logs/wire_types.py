@@ -2,7 +2,7 @@
 
 Both ROS 1 serialisation and CDR write these types field after field.
 
-A .msg definition (http://wiki.ros.org/msg, and ROS 2's bounds and defaults) in a log holds the message first, then
+A .msg definition (http://wiki.ros.org/msg, and ROS 2's bounds and defaults) in a log contains the message first, then
 every message it is made of, each below a line of ``=`` and ``MSG: package/Name``. Constants, defaults and comments do
 not matter for reading.
 """
@@ -33,12 +33,12 @@ class Scalar:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A length-prefixed string: so many bytes of UTF-8."""
+    """A length-prefixed string in UTF-8."""
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A message: named fields in wire order, which unfold to so many columns."""
+    """A message: named fields in wire order, and their total number of columns."""
 
     name: str
     fields: tuple[tuple[str, WireType], ...]
@@ -47,7 +47,7 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """``length`` elements, or, where it is None, as many as a count before them says."""
+    """``length`` elements; if it is None, a count precedes them."""
 
     element: Scalar | Text | Record
     length: int | None
@@ -107,7 +107,7 @@ class FieldType:
     """A field's type: a base type, or the full name of a message.
 
     ``text_limit`` is the most characters of a text (0: any number); ``length`` is None for one value, else the number
-    of elements: exactly so many where ``fixed``, at most so many otherwise (0: any number).
+    of elements: the exact number if ``fixed``, otherwise the largest number (0: any number).
     """
 
     name: str
@@ -184,7 +184,7 @@ class Dialect:
 
 ROS1 = Dialect(0, 1, 0, 0, 0)
 CDR = Dialect(4, 8, 1, 1, 3)
-"""Plain CDR, version 1: what the middlewares of ROS 2 write."""
+"""Plain CDR, version 1, the format of ROS 2 middlewares."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +197,7 @@ class Grid:
 
     def view(self, data: Bytes, dtype: np.dtype[np.generic], count: int = 1) -> GenericArray:
         """Return a copy of the values there, ``count`` side by side at each place, in the order of `list_offsets`."""
-        together = dtype if count == 1 else np.dtype(f"V{count * dtype.itemsize}")  # many at once are copied faster
+        together = dtype if count == 1 else np.dtype(f"V{count * dtype.itemsize}")  # one large copy is faster
         if not count:
             return np.zeros(0, dtype)
         found: GenericArray = np.ndarray(self.shape, together, data, self.first, self.strides)
@@ -212,7 +212,7 @@ class Grid:
 
 
 Places = Ints | Grid
-"""Where the M values of a field lie, as an array (M,) or a grid."""
+"""Offsets of the M values of a field, as an array (M,) or a grid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +274,7 @@ def walk(message: Record, data: Bytes, starts: Ints, ends: Ints, dialect: Dialec
         cursors = _Cursors(data, places, sizes, dialect)
         try:
             root = cursors.record(message, np.arange(len(sizes)))
-        except LayoutError:  # which stands for all of them
+        except LayoutError:  # it represents all of them
             break
         good = cursors.find_finished()
         if good.all():
@@ -357,7 +357,7 @@ class _Cursors:
         return _join_values(pieces, order)
 
     def regular(self, element: Text | Record, rows: Ints, counts: Ints) -> Values | None:
-        """Step over all elements at once where each takes the same room wherever it stands; None where they do not."""
+        """Skip all elements in one step if they have equal sizes at any alignment; None otherwise."""
         size, stride, alignment = _find_regular_size(element, self._dialect.max_alignment)
         if not size or counts.max(initial=0) < 2:
             return None

@@ -1,1 +1,1 @@
-"""Steady driving: masks over the rows of a track, stretches between them, and the ledger of every metre."""
+"""Steady driving: masks over the rows of a track, sections between them, and the distance breakdown."""

@@ -27,9 +27,10 @@ def find_kept_spans(dropped_by: NDArray[np.uint32], piece: Ints) -> Ints:
 
 
 def find_interval_reason(dropped_by: NDArray[np.uint32], piece: Ints) -> NDArray[np.uint32]:
-    """Return one reason for each interval between rows, shape (N - 1,); 0 inside a stretch.
+    """Return one reason for each interval between rows, shape (N - 1,); 0 inside a kept section.
 
-    A hole is a gap. Otherwise the reasons of both ends apply, and of several the first in the order of `DropReason`.
+    A gap has the reason gap. Otherwise the reasons of both ends apply, and of several the first in the order of
+    `DropReason`.
     """
     both = (dropped_by[:-1] | dropped_by[1:]).astype(np.int64)
     lowest = both & -both
@@ -37,13 +38,13 @@ def find_interval_reason(dropped_by: NDArray[np.uint32], piece: Ints) -> NDArray
 
 
 JUMP_M = 1.0
-"""A step that differs by more than this from what its velocity explains is no driving [m]."""
+"""Largest difference of a step from the distance by velocity [m]; a larger step is a jump of the estimate."""
 
 
 def compute_unexplained_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats, piece: Ints) -> Floats:
-    """Return how far each step is horizontally from the velocity's, [m], shape (N - 1,); 0 across gaps.
+    """Return the horizontal difference of each step from the distance by velocity [m], (N - 1,); 0 across gaps.
 
-    Parameters are `compute_interval_length_m`'s.
+    Parameters as in `compute_interval_length_m`.
     """
     step_s = np.diff(stamp_ns).astype(np.float64) * 1e-9
     explained = 0.5 * (velocity_mps[1:, :2] + velocity_mps[:-1, :2]) * step_s[:, None]
@@ -79,7 +80,7 @@ def sum_by_reason(reason: NDArray[np.uint32], amount: Floats) -> dict[str, float
 
 
 KEPT = "kept"
-"""The entry of metres that are in use."""
+"""Name of the entry for used metres."""
 _MOST_LOSSES = 10
 _WORTH_M = 0.05
 
@@ -105,18 +106,18 @@ def find_losses(breakdown_m: Mapping[str, float], subject: Subject) -> list[Find
 
 @dataclass(frozen=True, slots=True)
 class StoreLoss:
-    """Metres that are in no segment for one reason."""
+    """Metres outside segments for one reason."""
 
     reason: str
     metres: float
     share: float
     """Fraction of all metres driven [1]."""
     runs: int
-    """Runs that lost metres so."""
+    """Number of runs with this loss."""
 
 
 def find_largest_losses(ledgers_m: Iterable[Mapping[str, float]]) -> tuple[StoreLoss, ...]:
-    """Return the ten largest losses of runs, by their ledgers [m], the largest first."""
+    """Return the ten largest losses of runs, by their distance breakdowns [m], the largest first."""
     metres, of_runs = Counter[str](), Counter[str]()
     for distance_by_reason_m in ledgers_m:
         metres.update(distance_by_reason_m)

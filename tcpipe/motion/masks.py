@@ -49,7 +49,7 @@ def find_turning_in_place(
 
 
 def find_reversing(rows: MotionRows, *, stationary_velocity_mps: float) -> Mask:
-    """Return rows driven backwards faster than standing."""
+    """Return rows driven backwards, faster than a stationary robot."""
     return rows.velocity_mps < -stationary_velocity_mps
 
 
@@ -68,10 +68,10 @@ def find_accelerating(
 
 
 def find_ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, above_mps2: float, min_s: float) -> Mask:
-    """Return the rows beside halted ones over which the speed still grows after, or already falls before, the halt.
+    """Return the rows next to stops in which the speed still grows after, or already falls before, the stop.
 
     A ramp ends when the speed changes by less than ``above_mps2`` for ``min_s`` [s]. It is marked with and without
-    commands: a robot whose commands end (dead man's switch, emergency stop) coasts to a halt while its last command
+    commands: a robot whose commands end (dead man's switch, emergency stop) coasts to a stop while its last command
     persists. ``halted`` rows are stationary or turn in place.
     """
     speeding_up = np.sign(rows.velocity_mps) * acceleration_mps2
@@ -129,7 +129,7 @@ def _find_moment(command: Floats, before_mps: float, after_mps: float, *, step_m
 
 
 def find_below_full_speed(rows: MotionRows, *, limit_mps: float, window_s: float) -> Mask:
-    """Mark rows whose command, and its mean over the window around them, is below the limit: a joystick jitters."""
+    """Mark rows whose command, and its mean over the window around them, is below the limit (joysticks jitter)."""
     part, command = _select_known_command(rows)
     speed = np.abs(command)
     half = rows.count(window_s / 2)

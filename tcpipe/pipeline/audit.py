@@ -207,8 +207,7 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
     return WithheldComparisons(tuple(comparisons), tuple(skipped), {})
 
 
-_OTHER_ARM = {"lever-arm-unknown", "lever-arm-contradicted"}
-"""Findings of an antenna that is elsewhere than stated."""
+_OTHER_ARM = {"lever-arm-unknown", "lever-arm-contradicted"}  # findings of an antenna that is elsewhere than stated
 
 
 def _compare_fixes(track: Track, section: Section, gnss: Positions, windows_ns: Ints, arm_m: Floats) -> Comparison:
@@ -319,14 +318,14 @@ def audit(
     message_definitions: Path | None = None,
     store: Location = "tcpipe-store",
 ) -> Audit:
-    """Withhold fixes in windows, fuse the rest, and score the track by what was withheld.
+    """Withhold fixes in windows, fuse the other data, and compare the track with the withheld fixes.
 
     Raises `UsageError`: the run is too short, or has no sensor beside the one that would be withheld; `LogError`,
     `RecipeError`, `StoreError`, `FusionError`: it cannot be read or fused.
 
     Parameters
     ----------
-    run : a log, or a run of the store (RUN or RUN/RECIPE), which is fused as its own recipe says.
+    run : a log, or a run of the store (RUN or RUN/RECIPE), which is fused with its own recipe.
     recipe, robot, message_definitions : how a log is read and fused, as `tcpipe.pipeline.ingest.ingest` takes them.
     store : where a run is looked up.
     """

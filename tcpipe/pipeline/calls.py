@@ -24,7 +24,7 @@ from tcpipe.tables.findings import Remedy, Subject, make_finding
 
 
 def identify_process() -> Process:
-    """Return what distinguishes this process from any other; "" for what the system does not say (other than Linux)."""
+    """Return the identity of this process; parts that the system does not provide (other than Linux) are ""."""
     boot, machine = (_read_text(path) for path in ("/proc/sys/kernel/random/boot_id", "/etc/machine-id"))
     namespace = ""
     with suppress(OSError):
@@ -61,7 +61,7 @@ class OpenCall:
     name: str
     """By which it is acknowledged."""
     state: Literal["running", "perhaps running", "killed"]
-    """``perhaps running`` where its process cannot be looked at from here."""
+    """``perhaps running`` if its process cannot be observed from here."""
     call: Call
 
     @property
@@ -132,7 +132,7 @@ class RunningCall:
             self.put(self.call)
 
     def put(self, call: Call) -> None:
-        """Write the record of the call; a store that cannot be written to goes without."""
+        """Write the record of the call; a read-only store gets no record."""
         try:
             self.store.put(self.state, "calls", self.key, call)
         except StoreError as error:
@@ -188,7 +188,7 @@ def describe_error(error: Exception) -> dict[str, Any]:
 def _close_killed_calls(running: RunningCall) -> None:
     """Write the end of killed calls whose work this call has done.
 
-    A call counts as killed only if a listing that is made after its process was seen dead shows no end of it.
+    A call counts as killed only if a listing made after its process was found dead shows no end of it.
     """
     dead = [open_call for open_call in list_open_calls(running.state) if open_call.state == "killed"]
     for each in dead:

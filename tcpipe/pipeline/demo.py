@@ -19,7 +19,7 @@ from tcpipe.simulation import simulate
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """Where everything is; ``str`` of it is what the command prints."""
+    """Paths of all outputs; ``str`` of it is the command's output."""
 
     directory: Path
     ingested: IngestSummary
@@ -28,7 +28,7 @@ class DemoResult:
     unchanged: bool
 
     def __str__(self) -> str:
-        """Return where everything is and what to open."""
+        """Return the paths of all outputs, and what to open."""
         here = self.directory
         return "\n".join(
             (
@@ -50,14 +50,13 @@ class DemoResult:
         )
 
 
-_PARTS = 5
-"""Steps of the demo: simulate, ingest, add-map, build-dataset, report."""
+_PARTS = 5  # steps of the demo: simulate, ingest, add-map, build-dataset, report
 
 
 def run_demo(directory: Path, *, seed: int, begin_part: Callable[..., None]) -> DemoResult:
     """Simulate, ingest, add the map, build the dataset and write the reports under ``directory``.
 
-    Raises `UsageError`: the directory holds something else; `DatasetError`: a step fails (which would be a bug).
+    Raises `UsageError`: the directory has other content; `DatasetError`: a step fails (which would be a bug).
     """
     site_path, store_path, dataset_path = directory / "site", directory / "store", directory / "dataset"
     clear(directory)

@@ -24,13 +24,12 @@ _LABELS = ("power_watt", "velocity_mps", "duration_s", "energy_joule")
 _STDS = ("power_std_watt", "velocity_std_mps", "duration_std_s", "energy_std_joule")
 _LABELLED = (*_LABELS, "fused_velocity_mps", *_STDS)
 _DRAWN = ("split", "fold")
-_SHARED = 0.9
-"""Smallest shared fraction of the time of two samples that are compared."""
+_SHARED = 0.9  # smallest shared fraction of the time of two samples that are compared
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Two datasets held against each other; ``str`` of it is what the command prints."""
+    """Comparison of two datasets; ``str`` of it is the command's output."""
 
     a: str
     b: str
@@ -51,7 +50,7 @@ class Difference:
     differing: int
     """Number of samples that only one has, or that have other values, another split or another patch."""
     same: bool
-    """Whether nothing differs."""
+    """Whether both are equal."""
 
     @property
     def exit_code(self) -> int:
@@ -231,7 +230,7 @@ def list_causes(a: DatasetCard, b: DatasetCard) -> tuple[str, ...]:
 
 
 def _describe_change(change: RecordChange, a: DatasetCard, b: DatasetCard) -> str:
-    """Return what differs in an entry, by its value or, of content, that it is another."""
+    """Return the difference of an entry: both values, or, for content, only that it differs."""
     field = change.path[0]
     head, name = _WORDS.get(field, field.replace("_", " ")), f" {change.name}" if change.name else ""
     values = (change.was, change.now)

@@ -26,8 +26,7 @@ from tcpipe.tables.bits import DropReason, Quality, flag_names
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.levels import GEOMETRY, Streams
 
-_NEARBY_NS = 5_000_000_000
-"""Rejections this long before and after a segment are printed [ns]."""
+_NEARBY_NS = 5_000_000_000  # rejections this long before and after a segment are printed [ns]
 
 
 Value: TypeAlias = str | int | float | bool | None
@@ -107,7 +106,7 @@ class History:
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """A sample's whole history; ``str`` of it is what the command prints."""
+    """A sample's whole history; ``str`` of it is the command's output."""
 
     sample_id: str
     facts: History

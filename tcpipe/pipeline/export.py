@@ -1,4 +1,4 @@
-"""Any topics of a log as Parquet: useful to people who need nothing else of tcpipe."""
+"""Export topics of a log as Parquet, also for users who need no other part of tcpipe."""
 
 import itertools
 import re
@@ -25,7 +25,7 @@ from tcpipe.tables.findings import Findings
 from tcpipe.tables.levels import add_metadata, read_metadata
 
 INDEX = "export.json"
-"""File that lists the exported topics and their log, so that a second call has nothing to do."""
+"""File that lists the exported topics and their log, so that a second call does nothing."""
 _LONGEST_STEM = 200
 
 
@@ -156,7 +156,7 @@ def _select_topics(log: AnyLog, log_path: str, topics: Sequence[str]) -> list[st
 
 
 def _read_index(out: Path) -> ExportIndex | None:
-    """Return what ``out`` holds; an index that is not as this version writes it counts for nothing."""
+    """Return the index of ``out``; an index of another version is ignored."""
     if (out / INDEX).is_file():
         with suppress(StoreError):
             return read_as(out / INDEX, ExportIndex)
@@ -164,7 +164,7 @@ def _read_index(out: Path) -> ExportIndex | None:
 
 
 def _refuse_what_is_ours(out: Path) -> None:
-    """Refuse to write between the files of what is counted and sealed."""
+    """Reject a directory inside a store or dataset, whose files are counted and sealed."""
     signs = {
         "dataset": "dataset.json", "map": "zarr.json", "model": "model.json", "cost map": "cost-map.json",
     }  # fmt: skip

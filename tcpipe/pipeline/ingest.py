@@ -91,7 +91,7 @@ class IngestSummary:
 
 @dataclass(frozen=True, slots=True)
 class SummaryLine:
-    """The last line of ``ingest --json``: what became of all logs."""
+    """The last line of ``ingest --json``: the results of all logs."""
 
     recipe: str
     """The file that rules, or that it is the defaults."""
@@ -127,7 +127,7 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     given = tuple(make_absolute(path) for path in options.logs if not is_presigned(path))  # signed URLs are not stored
     definitions = options.msgdef and str(Path(options.msgdef).absolute())
     key = None
-    with suppress(TcpipeError):  # what is wrong with the recipe is an error of the call, which is recorded
+    with suppress(TcpipeError):  # an error in the recipe is an error of the call, which is recorded
         ruling = resolve_recipe(options.recipe)
         options, key = replace(options, recipe=ruling), ingest_key(ruling)
     how = CallOptions(options.robot, options.as_one, definitions or None, key)
@@ -207,7 +207,7 @@ def _warn_of_unmatched_windows(windows: Iterable[TimeWindow], state: State) -> N
 
 
 def _describe_call(summary: IngestSummary) -> dict[str, Json]:
-    """Return what the record of a call holds of its work."""
+    """Return the part of a call's record on its work."""
     failed = [result for result in summary.results if result.status == "failed" and not result.known]
     return {
         "exit_code": summary.exit_code,
@@ -241,7 +241,7 @@ def _iterate_finished(state: State, steps: Sequence[PlannedLog]) -> Iterator[tup
 def _iterate_results(
     call: RunningCall, steps: Sequence[PlannedLog], *, jobs: int, cluster: str | None
 ) -> Iterator[tuple[int, IngestResult]]:
-    """Yield what became of each log by its index, as it ends."""
+    """Yield the result of each log with its index, when it ends."""
     known = {problem.key for row in call.state.runs.values() for problem in find_problems(row)}
     for turn in iterate_rounds(steps):
         with closing(run_all(ingest_one, [task for _, task in turn], jobs=jobs, cluster=cluster)) as outcomes:
@@ -252,7 +252,7 @@ def _iterate_results(
 
 
 def _record_result(call: RunningCall, task: IngestTask, ended: Ingested, known: set[str]) -> IngestResult:
-    """Write that a log was seen, and why it failed; return its result with what is known of its problems."""
+    """Write the state of a log, and its failure; return its result with the state of its problems."""
     source, result, state = ended.source, ended.result, call.state
     try:
         if result.status == "failed" and not result.transient:

@@ -126,10 +126,10 @@ def tag_log(store: Store, state: State, sha256: str, given: Mapping[str, str]) -
 
 
 def _find_hash(state: State, log: AnyLog) -> str:
-    """Return the hash by which the store knows a log, or is to know it (ADR-36).
+    """Return the hash that identifies a log in the store (ADR-36).
 
     That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A
-    run with damage is not taken for it: what was broken there may be whole here.
+    run with damage does not count as the same: its damaged parts may be intact here.
     """
     outline, sha256 = log.outline, log.sha256()
     for row in state.runs.values() if outline else ():
@@ -231,8 +231,7 @@ def make_run(
 
 
 _FIRST_ROWS = 20
-_IDENTIFYING = ("gnss", "pose", "imu", "wheel_odometry", "visual_odometry")
-"""Sensors whose values seldom repeat."""
+_IDENTIFYING = ("gnss", "pose", "imu", "wheel_odometry", "visual_odometry")  # sensors whose values seldom repeat
 
 
 def describe_recording(streams: Streams) -> Recording | None:

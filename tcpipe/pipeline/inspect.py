@@ -151,8 +151,8 @@ def inspect(
 def _inspect_url(url: str, ask: Callable[[Location], InspectedLog]) -> Inspected:
     if is_presigned(url):
         return ask(url)
-    if not is_log_file(url):  # of a log nothing else need be readable
-        with suppress(StoreError):  # what is wrong with the bucket is told where logs are looked for
+    if not is_log_file(url):  # the rest of a log need not be readable
+        with suppress(StoreError):  # the search for logs reports problems of the bucket
             if is_store(url):
                 return _inspect_store(Store(url))
         if find_newest(url, CARDS):

@@ -31,8 +31,7 @@ from tcpipe.tables.findings import Finding, Findings, Subject, make_finding, omi
 
 _GAP_PERIODS, _GAP_NS = 3, 300_000_000
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
-_TIMES = 2
-"""Columns before the message's own: both times of the log."""
+_TIMES = 2  # columns before the message's own: both times of the log
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +41,7 @@ class StampCounts:
     messages_read: int
     longest_gap_s: float | None
     gaps: int
-    """Where log time and header agree that nothing came."""
+    """Gaps by both log time and header stamps."""
     zero_stamps: int | None = None
     backward_stamps: int | None = None
     repeated_stamps: int | None = None
@@ -102,7 +101,7 @@ class InspectedLog:
 def inspect_log(
     log: Log | TableLog, recipe: Recipe, robot: str | None, *, full: bool, reads_roles: bool = False
 ) -> InspectedLog:
-    """Return what a log holds.
+    """Return the content of a log.
 
     With ``full`` every message is read: counts, gaps, stamps, clock steps and damage; with ``reads_roles`` those of the
     used topics, for the proposed recipe.
@@ -191,7 +190,7 @@ def _read(
 def _add_stamps(
     topic: InspectedTopic, stamps: TopicStamps, timeline: TopicTimeline | None, *, simulated: bool
 ) -> InspectedTopic:
-    """Return a topic with what its messages do; without a timeline they have no header."""
+    """Return a topic with statistics of its messages; without a timeline they have no header."""
     counts = stamps.counts()
     if timeline is None:
         return replace(topic, stamps=counts)
@@ -261,12 +260,12 @@ class TopicStamps:
         self._last = table.take([table.num_rows - 1])  # a slice would keep all of it
 
     def topic_times(self) -> TopicTimes:
-        """Return them for `tcpipe.logs.clocks`: what repeats a message exactly has its content."""
+        """Return the times for `tcpipe.logs.clocks`; exact repetitions of a message have equal content."""
         log_ns, header_ns, same = self._joined()
         return TopicTimes(log_ns, header_ns, (np.cumsum(~same).astype(float),))
 
     def counts(self) -> StampCounts:
-        """Return what they show."""
+        """Return the statistics."""
         log_ns, header_ns, same = self._joined()
         steps, odd = np.diff(log_ns), dict[str, int]()
         period_ns = float(np.median(steps)) if len(steps) else 0.0

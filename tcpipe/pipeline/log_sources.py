@@ -1,4 +1,4 @@
-"""Logs on disk: which files are one run, their names, their share, and which hold the same recording."""
+"""Logs on disk: which files are one run, their names, the share of a task, and duplicate logs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _LONGEST_STEM_BYTES = 200
 class LogSource:
     """One log (several files of a drive with ``--as-one``): paths, size [byte] and modification time [ns] of each file.
 
-    A link is called what the user calls it: names, and what they say, are those of the link, not of what it leads to.
+    A link has the name that the user gives: tcpipe uses the name of the link, not of its target.
     """
 
     paths: tuple[Path, ...]
@@ -45,7 +45,7 @@ class LogSource:
     sha256: str | None = None
     """None where it has yet to be computed."""
     urls: tuple[str, ...] = ()
-    """Locations of the files, if one is in object storage; ``paths`` then are stand-ins of the same names and sizes."""
+    """Locations of the files, if one is in object storage; ``paths`` are then placeholders of equal names and sizes."""
     queries: tuple[str, ...] = field(default=(), repr=False)
     """Queries of presigned URLs, in the order of ``urls``; they are not printed or stored."""
     place: str = ""
@@ -62,7 +62,7 @@ class LogSource:
         return self.urls or tuple(str(path) for path in self.paths)
 
     def locations(self) -> tuple[Location, ...]:
-        """Return what the files are opened by: paths and URLs, with the queries of those that are presigned."""
+        """Return the paths and URLs by which the files are opened, including queries of presigned URLs."""
         queries = self.queries or ("",) * len(self.origins)
         whole = (f"{at}?{query}" if query else at for at, query in zip(self.origins, queries, strict=True))
         return tuple(at if is_url(at) else Path(at) for at in whole)
@@ -97,7 +97,7 @@ class LogSource:
         return self if files == self.files else replace(self, files=files, sha256=None)
 
     def has_changed(self) -> bool:
-        """Tell whether a file was written since; an object that was is refused when it is read."""
+        """Return whether a file was written since; changed objects are detected when they are read."""
         return not self.urls and _list_file_states(self.paths) != self.files
 
 
@@ -109,7 +109,7 @@ class FoundLogs:
     problems: Mapping[str, tuple[str, ...]]
     """By path as it was given."""
     transient: bool = False
-    """Whether what is in the way of a path may pass: a network that is down."""
+    """Whether the problem of a path may be temporary, such as a network that is down."""
 
 
 def list_log_sources(
@@ -117,8 +117,8 @@ def list_log_sources(
 ) -> FoundLogs:
     """Return the logs at or below the given paths.
 
-    With ``as_one`` they are all parts of one. Logs in object storage get stand-ins in ``staging``. A folder with one of
-    the files of ``tables`` is a log; if their names have a ``*``, the files of each run are one log.
+    With ``as_one`` they are all parts of one. Logs in object storage get placeholders in ``staging``. A folder with one
+    of the files of ``tables`` is a log; if their names have a ``*``, the files of each run are one log.
     """
     paths: dict[str, list[tuple[Path, str]]] = {}
     urls: dict[Path, str] = {}
@@ -210,7 +210,7 @@ def make_definitions_key(directory: Path | None) -> str:
 
 
 def find_remote_logs(url: str, directory: Path) -> dict[Path, str]:
-    """Return stand-ins for the logs at or below a URL, and the URL of each."""
+    """Return placeholders for the logs at or below a URL, and the URL of each."""
     directory.mkdir(parents=True)
     place = make_stand_ins(url, directory, wanted=is_log_file)
     return {
@@ -251,7 +251,7 @@ def _stat_files(path: Path) -> list[os.stat_result]:
 
 def recall_hash(source: LogSource, seen: LogSnapshot | None) -> LogSource:
     """Return the source with its hash if ``seen`` has the same sizes and times of its files."""
-    dated = bool(source.files) and all(time_ns for _, time_ns in source.files)  # not every server tells the time
+    dated = bool(source.files) and all(time_ns for _, time_ns in source.files)  # some servers give no time
     is_same = dated and seen is not None and seen.size_and_time == source.files
     return replace(source, sha256=seen.sha256) if is_same and seen is not None else source
 
@@ -274,7 +274,7 @@ def find_failure(log: str, error: str) -> Findings:
 
 
 def is_transient(error: BaseException) -> bool:
-    """Tell whether an error, or what it was raised from, may be gone when the same is tried again."""
+    """Return whether an error, or its cause, may be temporary."""
     causes = [error]
     while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
         causes.append(cause)

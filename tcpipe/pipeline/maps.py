@@ -43,7 +43,7 @@ class AddedMap:
     """A quick look at it: orthophoto or shaded relief, tinted by class, white where a layer has no data."""
 
     def __str__(self) -> str:
-        """Return where the map is and what it holds, as plain lines."""
+        """Return location and content of the map, as plain lines."""
         head = f"{self.path} (quick look: {PurePosixPath(self.picture).name})"
         if self.status == "unchanged":
             head += ": nothing to do: it is made from the same files and options"
@@ -112,7 +112,7 @@ add_map = as_function(AddMapOptions, run_add_map)
 def _refuse_layers(
     layers: Mapping[str, Files], categorical: Iterable[str], *, ortho: bool, ortho_bands: OrthoBands
 ) -> None:
-    """Raise `UsageError` for names that cannot be, classes of no layer, and colours of no orthophoto: all at once."""
+    """Raise `UsageError` for invalid names, classes without a layer, and colours without orthophoto, in one error."""
     problems = [problem for name in layers if (problem := find_wrong_name(name, taken=SAMPLES.names()))]
     listed = ", ".join(layers) or "none is given"
     problems += [
@@ -154,7 +154,7 @@ def _match_files(text: str) -> list[str]:
 
 
 def _describe_no_file(text: str) -> str:
-    """Say why a text names no file."""
+    """Return the reason why a text is not the name of a file."""
     if "://" in text or text.startswith("/vsi"):
         return f"{text}: is an address, expected a file on this machine: rio convert {text} local.tif"
     if Path(text).is_dir():
@@ -183,7 +183,7 @@ def _compute_checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[st
 
 
 def _find_unchanged(store: Store, state: State, name: str, inputs: MapInputs) -> AddedMap:
-    """Return the map that is there; `MapError` that says what differs, unless it is made from the same."""
+    """Return the existing map; `MapError` with the differences if it was made from other inputs."""
     try:
         found = open_map(*store.map_at(state.maps[name]))
     except (MapError, StoreError) as error:
@@ -205,7 +205,7 @@ def _find_unchanged(store: Store, state: State, name: str, inputs: MapInputs) ->
 
 
 def _describe_change(role: str, before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """Say how the files of a role, name to checksum, differ; nothing where their contents are the same."""
+    """Return the differences of a role's files (name to checksum); "" if their contents are equal."""
     if list(before.values()) == list(now.values()):
         return ""
     if sorted(before.values()) == sorted(now.values()):

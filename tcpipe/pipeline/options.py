@@ -72,7 +72,7 @@ class IngestOptions:
     on_result: Callable[[IngestResult], None] | None = None
     """Called as each log ends, in the order of ending."""
     on_note: Callable[[str], None] | None = None
-    """Called with a line that is said before the first result: that the store is new."""
+    """Called with a line before the first result: that the store is new."""
 
 
 Files: TypeAlias = Location | Sequence[Location]

@@ -33,8 +33,7 @@ GEOJSON = "foxglove_msgs/msg/GeoJSON"
 _FRAME = "tcpipe_enu"
 _SEGMENT_COLOUR, _DROPPED_COLOUR = "#1a9850", "#d73027"
 _DIAGONAL_KNOWN = 2
-_ROWS_A_VERTEX = 20
-"""Dropped stretches are drawn with a vertex a second."""
+_ROWS_A_VERTEX = 20  # time between vertices of dropped sections [s]
 
 _LABELS = (
     "power_watt", "power_std_watt", "velocity_mps", "velocity_std_mps", "duration_s", "duration_std_s", "energy_joule", "energy_std_joule",
@@ -64,7 +63,7 @@ class Overlay:
 
 
 def write_overlay(name: str, out: Path, *, store: Location = "tcpipe-store") -> Overlay:
-    """Write what became of a run as an MCAP of ROS 2 messages, whole or not at all; the same run gives the same bytes.
+    """Write the results of a run as an MCAP file of ROS 2 messages, atomically; the same run gives the same bytes.
 
     `UsageError`: there is no run of this name (RUN or RUN/RECIPE), or it is under several recipes, or ``out`` is there
     and no overlay: a recording is never replaced; `StoreError`: a file of the run, or its streams, which know the
@@ -129,7 +128,7 @@ class _Clock:
         self._stamp_ns, self._behind_ns = stamps, (_read_column(rows, "log_time_ns") - stamps).astype(float)
 
     def __call__(self, stamp_ns: Ints, epoch: Ints | None) -> Ints:
-        """Return the log time of each stamp [ns]; without epochs a stamp is of the first that holds it."""
+        """Return the log time of each stamp [ns]; without epochs the first one that contains it counts."""
         if epoch is None:
             epoch = self._epoch_of(stamp_ns)
         times = stamp_ns.copy()
@@ -235,7 +234,7 @@ def _iterate_segment_lines(segments: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def _iterate_dropped_lines(rows: pa.Table) -> Iterator[dict[str, Any]]:
-    """Yield a GeoJSON line for each stretch of masked rows with their reason."""
+    """Yield a GeoJSON line for each section of masked rows with their reason."""
     reasons, bits, epoch = (
         to_texts(rows.column("reasons")),
         _read_column(rows, "dropped_by"),

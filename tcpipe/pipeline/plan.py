@@ -77,11 +77,11 @@ class IngestResult:
     notes: tuple[str, ...] = ()
     """Notes: why it waits, which runs it supersedes."""
     transient: bool = False
-    """Whether it failed for what may pass: a full disk, a killed worker."""
+    """Whether the failure may be temporary: a full disk, a killed worker."""
     known: bool = False
-    """Whether it failed before and was not tried again, or what is wrong with its run was reported before."""
+    """Whether it failed before and was not tried again, or the problem of its run was reported before."""
     acknowledged: bool = False
-    """Whether a person has acknowledged what is wrong with it (`tcpipe acknowledge`)."""
+    """Whether a person has acknowledged its problem (`tcpipe acknowledge`)."""
     traceback: str | None = None
     """Where an internal error comes from."""
 
@@ -106,7 +106,7 @@ class LogLine(IngestResult):
 
 
 def make_result(source: LogSource, status: Status, made: RunFacts, sha256: str, *, same_as: str | None) -> IngestResult:
-    """Return what became of a log whose run is in the store."""
+    """Return the result of a log whose run is in the store."""
     if status == "done":
         status = made.defect or status
     return IngestResult(source.name, status, made, made.verdict, same_as=same_as, sha256=sha256)
@@ -123,7 +123,7 @@ def check_age(task: IngestTask, now_ns: int | None = None) -> IngestResult | Non
 
 
 def make_died_result(source: LogSource) -> IngestResult:
-    """Return that the process which worked on a log is gone."""
+    """Return the result of a log whose process has died."""
     problem = f"{source.name}: its worker process died (killed, or out of memory); run it again"
     findings = find_failure(source.name, "WorkerDied")
     return IngestResult(source.name, "failed", causes=findings, problems=(problem,), transient=True)
@@ -149,7 +149,7 @@ def mark_reported(task: IngestTask, act: Callable[[IngestTask], R]) -> R | Inges
 
 
 def _format_error(error: Exception, source: LogSource) -> tuple[tuple[str, ...], str | None]:
-    """Return lines about what went wrong with a log, and where an internal error comes from."""
+    """Return lines on the errors of a log, and on the origin of an internal error."""
     if isinstance(error, TcpipeError):
         return _add_log_name(source, error.problems), None
     if isinstance(error, OSError):
@@ -211,7 +211,7 @@ class _Known:
 
 
 def plan_ingestion(tasks: Iterable[IngestTask], state: State) -> tuple[PlannedLog, ...]:
-    """Return what each log needs, if it is to be ingested now."""
+    """Return the work for each log that is to be ingested now."""
     made, failures = dict[str, list[RunFacts]](), dict[str, list[LogFailure]]()
     for row in state.runs.values():
         made.setdefault(row.log.sha256, []).append(row)
@@ -268,7 +268,7 @@ def _stand(task: IngestTask, made: RunFacts, known: _Known) -> PlannedLog:
 
 
 def _describe_pending(task: IngestTask, known: _Known) -> str:
-    """Return why a log that was seen before is to be ingested; "" of a new one."""
+    """Return why a known log is to be ingested again; "" for a new one."""
     if before := known.failures.get(task.source.sha256 or task.source.files_digest):
         is_acknowledged = all(make_failure(each.content, each.log).key in known.acknowledged for each in before)
         return f"{_describe_failure(before, task)}{', acknowledged' if is_acknowledged else ''}; to be tried again"
@@ -287,7 +287,7 @@ def _describe_failure(before: Sequence[LogFailure], task: IngestTask) -> str:
 
 
 def _describe_outdated(made: RunFacts, task: IngestTask) -> str:
-    """Return in which an ingestion differs from what would be made now."""
+    """Return the settings in which an ingestion differs from the current ones."""
     if made.ingest_key != ingest_key(task.recipe):
         return f"made under another recipe ({made.recipe_id})"
     if made.results_version != RESULTS_VERSION:
@@ -298,7 +298,7 @@ def _describe_outdated(made: RunFacts, task: IngestTask) -> str:
 
 
 def list_transient_failures(calls: Sequence[Call]) -> dict[str, str]:
-    """Return the logs whose latest failure may pass, and what it was; ``calls`` begin with the latest."""
+    """Return the logs whose latest failure may be temporary, with the failure; ``calls`` begin with the latest."""
     found: dict[str, str] = {}
     for call in reversed(calls):
         found.update(call.failed)
@@ -306,7 +306,7 @@ def list_transient_failures(calls: Sequence[Call]) -> dict[str, str]:
 
 
 def _remove_name(line: str, task: IngestTask) -> str:
-    """Return what is wrong without the name of the log."""
+    """Return the problem without the name of the log."""
     for name in (task.source.name, *task.source.origins):
         line = line.replace(f"{name}: ", "").replace(name, "it")
     return line

@@ -1,7 +1,7 @@
 """Check a short test log before a campaign: segments per hour, lost distance, uncertainty of labels, remedies.
 
-The excerpt goes through the very stages that ingest runs, in memory: what is predicted of a log is what ingesting it
-would give.
+The excerpt goes through the same stages as in ingest, in memory: the prediction for a log is the result that ingesting
+it would give.
 """
 
 import math
@@ -48,7 +48,7 @@ WANTED_HZ: Mapping[str, float] = {
 }
 """Slower topics cost precision or columns; the rate of power depends on its source (`tcpipe.cost.labels`)."""
 
-_WORTH_SAYING = 0.05
+_MIN_SHARE = 0.05
 _MOST_LOSSES = 3
 _WINDOW_S, _FEWEST_WINDOWS = 10.0, 3
 
@@ -81,12 +81,12 @@ class ExpectedYield:
     energy_budget: EnergyBudget | None
 
     def lines(self) -> Iterator[str]:
-        """Yield it in words."""
+        """Yield the prediction as lines of text."""
         total = sum(self.distance_by_reason_m.values())
         shares = (
             (metres / total, name)
             for name, metres in self.distance_by_reason_m.items()
-            if total and metres >= _WORTH_SAYING * total
+            if total and metres >= _MIN_SHARE * total
         )
         where = ", ".join(f"{share:.0%} {name.replace('_', ' ')}" for share, name in sorted(shares, reverse=True))
         unsure = "" if self.segments_per_hour_std is None else f" ± {self.segments_per_hour_std:.0f}"
@@ -153,7 +153,7 @@ def preflight(
     robot: str | None = None,
     message_definitions: Path | None = None,
 ) -> Preflight:
-    """Return what recording like this promises.
+    """Predict the result of recording in the same way.
 
     ``log`` is a minute or more, of any container, or the URL of one, of a folder of logs the first; all of it is read.
     The rest is as `tcpipe.pipeline.ingest.ingest` takes it. `LogError`, `RecipeError`: it is no log, or cannot be read
@@ -202,7 +202,7 @@ def _summarize(
         problems=problems,
         findings=tuple(sort_findings(findings)),
         verdict=judge(findings),
-        losses=tuple(loss for loss in losses if loss.share > _WORTH_SAYING)[:_MOST_LOSSES],
+        losses=tuple(loss for loss in losses if loss.share > _MIN_SHARE)[:_MOST_LOSSES],
         recipe=seen.recipe or "",
         exit_code=0 if ready else 3 if expected_yield else 1,
     )
@@ -251,7 +251,7 @@ def _iterate_topics(facts: StageFacts, span_s: float) -> Iterator[RoleTopic]:
 def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:
     """Yield a warning for each role without a topic while it can be recorded; none if the recipe does without the role.
 
-    Without GNSS or power there is no sample: these are missed whatever the recipe says.
+    Without GNSS or power there is no sample: these are reported for every recipe.
     """
     present = {*roles, "gnss"} if "pose" in roles else {*roles}
     for code, role in {**MISSING, "no-command": "command"}.items():
@@ -262,7 +262,7 @@ def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:
 
 
 def find_slow(topics: Sequence[RoleTopic], expected_yield: ExpectedYield | None, span_s: float) -> Iterator[Finding]:
-    """Yield what is too slow, too short or absent for a part of the time to record a day in this way."""
+    """Yield findings on topics that are too slow, or absent for a part of the time, and on a log that is too short."""
     for topic in topics:
         subject, names = Subject("role", topic.role), {"topic": topic.topic}
         least_hz = read_threshold("rate-too-low", "min_rate_fraction") * (topic.wanted_hz or 0.0)

@@ -36,7 +36,7 @@ class Acknowledged:
 
 
 def find_incomplete_runs(state: State, run_id: str | None = None) -> Iterator[Problem]:
-    """Yield the runs, or those under one name, whose folders of payload are gone."""
+    """Yield the runs, or those under one name, whose folders of payload are missing."""
     for row in state.list_rows(run_id):
         if row.blob and not state.has_payload(row):
             folder = row.blob if row.blob not in state.blobs else row.streams_blob
@@ -45,7 +45,7 @@ def find_incomplete_runs(state: State, run_id: str | None = None) -> Iterator[Pr
 
 
 def find_incomplete_maps(state: State, name: str | None = None) -> Iterator[Problem]:
-    """Yield the maps, or the one of a name, whose folder of payload is gone."""
+    """Yield the maps, or the one of a name, whose folder of payload is missing."""
     for record in state.maps.values():
         if name in (None, record.name) and record.blob not in state.blobs:
             finding = make_finding(
@@ -81,7 +81,7 @@ def find_known_problems(state: State) -> Iterator[Problem]:
 
 
 def find_stale_outputs(store: Store, state: State) -> Iterator[Problem]:
-    """Yield the outputs whose last call failed, or that would be made of something else now and no call makes."""
+    """Yield the outputs whose last call failed, or whose inputs have changed, unless a call is running."""
     if not state.outputs:
         return
     from tcpipe.pipeline.dataset.build import find_changed_parts  # noqa: PLC0415  only for stores with datasets
@@ -102,7 +102,7 @@ def find_stale_outputs(store: Store, state: State) -> Iterator[Problem]:
 def acknowledge(names: Sequence[str], *, store: Location = "tcpipe-store") -> Acknowledged:
     """Acknowledge problems of runs, logs, datasets and killed calls: no exit code 3 until their content changes.
 
-    A run whose tables are missing is given up: it is not expected any more. A killed call counts as ended.
+    A run whose tables are missing is no longer expected. A killed call counts as ended.
 
     Raises `StoreError`: there is no store, or it cannot be written; `UsageError`: a name is not that of one run, log or
     dataset with a problem; nothing is acknowledged then.
@@ -165,7 +165,7 @@ def _name_problems(name: str, known: Iterable[Problem], state: State) -> list[Pr
 
 
 def _make_missing_problem(name: str, state: State) -> list[Problem]:
-    """Return the problem of a path that `ingest` was given and that holds no log."""
+    """Return the problem of a path of `ingest` that contains no log."""
     given = {log for call in _list_ingests(state) for log in call.works_on}
     path = next((path for path in (name, str(Path(name).absolute())) if path in given), None)
     if path is None:

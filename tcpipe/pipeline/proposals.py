@@ -85,7 +85,7 @@ class ProposedRecipe:
     log: str
 
     def describe_next_step(self, path: Path) -> str:
-        """Return what is left to do when the recipe is at a path."""
+        """Return the remaining steps for a recipe at a path."""
         decisions = sum(not line.is_certain for line in self.lines)
         left = f"{decisions} comments in it are yours to decide; " if decisions else ""
         stated = "" if path.parent.resolve() == Path.cwd() else f" --recipe {shlex.quote(str(path))}"
@@ -134,9 +134,9 @@ _CODES_NOTE = "if these are its codes; else rtklib, ublox, mavlink, navsat, gps_
 def propose_recipe(
     path: Location, *, robot: str | None = None, message_definitions: Path | None = None
 ) -> ProposedRecipe:
-    """Return the recipe for a log, or the first of a folder's, or the tables in a folder, whatever recipe there is.
+    """Return the recipe for a log, or the first of a folder's, or the tables in a folder, ignoring existing recipes.
 
-    Raises `LogError`, `UsageError`: there is nothing to read.
+    Raises `LogError`, `UsageError`: there is no readable log.
     """
     path, others, recipe = path if is_url(path) else Path(path), list[str](), Recipe()
     if isinstance(path, Path) and (is_store(path) or (path / "dataset.json").is_file()):
@@ -160,7 +160,7 @@ def propose_recipe(
 def propose_for_log(
     log: Log | TableLog, assigned: RoleAssignment, recipe: Recipe, proposals: Iterable[Finding], *, is_complete: bool
 ) -> ProposedRecipe:
-    """Return the recipe for a log as ``init --from`` writes it: what a recipe does not settle yet.
+    """Return the recipe for a log, as ``init --from`` writes it: keys that the current recipe does not define.
 
     ``proposals`` are what `find_proposals` finds in it. Unless it ``is_complete``, values are those of the first
     messages, and extrinsics from moving transforms are left out.
@@ -399,7 +399,7 @@ def _iterate_roles(table: _Table) -> Iterator[tuple[str, list[ProposedLine]]]:
 
 
 def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str], doubt: str = "") -> list[ProposedLine]:
-    """Return the lines of a table's mapping; [] where its values cannot be what its columns are called."""
+    """Return the lines of a table's mapping; [] if its values contradict the names of its columns."""
     values, units = _read_values(table, role, columns)
     mapped = {field: text for field, text in columns.items() if field in values}
     judged = None if _list_lacking(role, mapped) else _judge_values(role, mapped, values)
@@ -434,8 +434,7 @@ def _list_lacking(role: str, fields: Collection[str]) -> list[str]:
 
 
 _OVER_TRACK, _TRACK_NOTE = "/ 0.5", "state the track width in place of 0.5 m"
-_TIMES_RADIUS = " * 0.1"
-"""End of a speed by revolutions, for wheels with a radius of 0.1 m."""
+_TIMES_RADIUS = " * 0.1"  # end of a speed by revolutions, for wheels with a radius of 0.1 m
 
 
 def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> tuple[dict[str, Floats], dict[str, str]]:

@@ -1,7 +1,8 @@
 """Removal of replaced documents, given-up runs and unnamed payload from a store; datasets are not changed.
 
 A removal is safe beside other calls (ADR-36): only documents that did not count in a first scan go, and only payload
-that was listed before a second scan and that no document of this scan names. While another call may run, nothing goes.
+that was listed before a second scan and that no document of this scan names. Nothing is removed while another call may
+run.
 """
 
 from collections import Counter
@@ -24,13 +25,12 @@ from tcpipe.pipeline.problems import forget_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 
-_MAX_CALLS = 50
-"""Ended calls of each command that are kept."""
+_MAX_CALLS = 50  # ended calls of each command that are kept
 
 
 @dataclass(frozen=True, slots=True)
 class Leftover:
-    """Something that could go: what it is, its name, its size; and why it stays, if it does."""
+    """A candidate for removal: kind, name and size; and the reason if it is kept."""
 
     what: str
     name: str
@@ -56,7 +56,7 @@ class Pruned:
     size_bytes: int
     """Size of the removed payload [byte]."""
     waits_for: str | None = None
-    """A call that may still run: nothing went."""
+    """A call that may still run, so that nothing was removed."""
 
     def __str__(self) -> str:
         """Return the lines as one text."""
@@ -79,13 +79,13 @@ def prune(
     forget: Sequence[str] = (),
     dry_run: bool = False,
 ) -> Pruned:
-    """Remove what a store no longer needs.
+    """Remove the parts of a store that are no longer needed.
 
     Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, it cannot be written to, or a name is unknown.
 
-    Without ``runs`` (RUN or RUN/RECIPE), superseded runs go, and those under an old recipe whose log also has a run
-    under the ``recipe`` that rules. What a dataset refers to stays, unless another dataset lies at its place or
-    ``forget`` names it. With ``dry_run`` nothing changes.
+    Without ``runs`` (RUN or RUN/RECIPE), superseded runs are removed, and those under an old recipe whose log also has
+    a run under the current ``recipe``. Runs of a dataset are kept, unless another dataset is at its place or ``forget``
+    names it. With ``dry_run`` nothing changes.
     """
     ruling, opened = ingest_key(resolve_recipe(recipe)), open_store(store)
     forgotten, left = [make_absolute(name) for name in forget], _find_temporaries(opened)
@@ -124,8 +124,7 @@ def _find_running(state: State, dead: Collection[str], mine: str) -> str | None:
     return None
 
 
-_Chosen = dict[str, tuple[RunFacts, str]]
-"""By key: a run whose tables are to go, and why."""
+_Chosen = dict[str, tuple[RunFacts, str]]  # by key: a run whose tables are removed, and the reason
 
 
 def _choose_named(store: Store, state: State, names: Sequence[str]) -> _Chosen:
@@ -170,7 +169,7 @@ def _find_references(state: State, forgotten: Collection[str]) -> dict[tuple[str
 
 
 def _read_inputs(where: str) -> str | None:
-    """Return the digest of what the dataset at a path or URL is made of; None without a readable one."""
+    """Return the digest of the inputs of a dataset at a path or URL; None without a readable dataset."""
     try:
         found = find_newest(where, [CARD])
         return None if found is None else parse_card(found.data, found.place.where(CARD), proved=False).inputs
@@ -191,7 +190,7 @@ class _Removal:
     earlier: dict[str, str] = field(default_factory=dict)
     """By key: the documents that named their tables."""
     documents: list[list[str]] = field(default_factory=list)
-    """Group after group: a kill between them lets no replaced document count again."""
+    """Groups in order of removal: after a kill between them no replaced document becomes valid again."""
     payload: list[str] = field(default_factory=list)
     """Folders, and files of folders in use."""
     removed: list[Leftover] = field(default_factory=list)
@@ -256,7 +255,7 @@ class _Removal:
         self.removed += [Leftover(*label, size_bytes) for label, size_bytes in sizes.items()]
 
     def execute(self) -> None:
-        """Remove what is chosen, and what killed calls left on disk."""
+        """Remove the chosen parts, and temporaries of killed calls."""
         if not self.dry_run:
             place = self.store.place
             for names in (*self.documents, self.payload):
@@ -264,14 +263,14 @@ class _Removal:
             place.clear()
 
     def describe(self, waits_for: str | None) -> Pruned:
-        """Return what was removed, or would be."""
+        """Return the removed parts, or those that would be removed."""
         size_bytes, documents = sum(each.size_bytes for each in self.removed), sum(map(len, self.documents))
         told = tuple(self.removed), tuple(self.kept), documents, size_bytes
         return Pruned(str(self.store.root), self.dry_run, *told, waits_for)
 
 
 def _find_temporaries(store: Store) -> list[Leftover]:
-    """Return what killed calls left on disk: the next call that writes removes it."""
+    """Return the temporaries of killed calls, which the next writing call removes."""
     paths = sorted(store.place.path.glob(f"{TEMPORARY_PREFIX}*")) if store.place.path else []
     sizes = {
         path: sum(each.stat().st_size for each in path.rglob("*") if each.is_file())

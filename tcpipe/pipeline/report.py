@@ -31,8 +31,7 @@ from tcpipe.report.store_report import RunKey, StoredDataset, StoreFacts, store_
 from tcpipe.store import Store, find_named_runs, is_path, is_store
 from tcpipe.tables.findings import read_catalogue_version
 
-_FEW_RUNS = 10
-"""The page of a store with fewer runs begins with their tracks and the table."""
+_FEW_RUNS = 10  # the page of a store with fewer runs begins with their tracks and the table
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +49,7 @@ def report(
 ) -> list[Page]:
     """Write ``report.html`` into a dataset or a store, local or at a URL, or for a run of the store; return the pages.
 
-    A page whose bytes would be the same is not written, and that of a run whose inputs are the same is not rendered.
+    A page is only written if its bytes change, and the page of a run is only rendered if its inputs change.
 
     Raises `UsageError`: the path is something else; `StoreError`: something cannot be read; all other pages of a store
     are written.

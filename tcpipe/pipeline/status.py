@@ -1,6 +1,6 @@
-"""The state of every log of a store's sources and of its outputs, why, and what is to do.
+"""State of every log of a store's sources and of its outputs, with the reason, and what to do.
 
-Nothing is read of a log but its size and time.
+Only size and time of a log are read.
 """
 
 from collections import Counter
@@ -33,7 +33,7 @@ _IN_WORDS: Mapping[LogState, str] = {"failed_permanent": "failed permanently", "
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Logs that stand at one point for one reason."""
+    """Logs in one state for one reason."""
 
     state: LogState
     cause: str
@@ -50,7 +50,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """Where the logs of a store's sources and its outputs stand."""
+    """State of the logs of a store's sources, and of its outputs."""
 
     store: str
     to_do_now: str
@@ -90,7 +90,7 @@ class Status:
 
 
 def find_log_states(options: IngestOptions, *, create: bool = False) -> Status:
-    """Return what a call of ingest with these options would find; with ``create`` the store need not be there.
+    """Return the state that a call of ingest with these options would find; with ``create`` the store need not exist.
 
     Without logs: those that the latest calls of ingest were given, with the options of these calls. A log that was
     written more recently than ``min_age_s`` is growing.
@@ -178,7 +178,7 @@ def _find_tasks(
 
 
 def _describe_first(problems: Sequence[Problem], groups: Sequence[Group]) -> str:
-    """Return what to do now: the first problem, else the first trouble with logs, else what is to be ingested."""
+    """Return the next step: the first problem, else the first problem of logs, else the logs to ingest."""
     if problems:
         more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
         return f"to do now: {format_finding(problems[0].finding)}{more}"

@@ -1,4 +1,4 @@
-"""Re-read everything a path holds and compare it with what was written down about it: seals, checksums, counts."""
+"""Re-read all content of a path, and compare it with its recorded seals, checksums and counts."""
 
 import itertools
 from collections.abc import Generator, Iterable, Iterator, Mapping
@@ -82,7 +82,7 @@ class Verified:
         return 1 if self.problems else 0
 
     def __str__(self) -> str:
-        """Return a line of what was read, and one for each problem."""
+        """Return a line with the amount read, and one for each problem."""
         read = ", ".join(f"{count} {what}" for what, count in self.read.items()) or "nothing"
         count = len(self.problems)
         verdict = f"{count} problem{'s' if count > 1 else ''}" if count else "no changes found"
@@ -114,7 +114,7 @@ def verify(path: Location, *, store: Location = "tcpipe-store") -> Verified:
 
 
 def _find_kind(path: Location, store: Location) -> tuple[str, Iterator[CheckResult]]:
-    """Return what a path is, and its findings, which are made as they are asked for."""
+    """Return the kind of a path, and an iterator of its findings."""
     if not is_url(path) and not Path(path).exists():
         place = Store(store).place
         return "run", _verify_runs(place, [(run.facts, run.document) for run in find_named_runs(path, store)])
@@ -130,11 +130,11 @@ def _find_kind(path: Location, store: Location) -> tuple[str, Iterator[CheckResu
 
 
 def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
-    """Yield what was read of the files that a card lists, and a line for everything that is not as it says."""
+    """Yield the amount read of the files in a card, and a line for each difference from the card."""
     place, where, kind = found.place, found.place.where(found.name), _KINDS[found.name]
     repair = f"{path}: copy it again, or {_HOW_MADE[kind]} it again"
     if broken := find_broken_seal(found.data, where):
-        yield from (broken, Repair(f"{repair} elsewhere"))  # its checksums say nothing of the other files
+        yield from (broken, Repair(f"{repair} elsewhere"))  # its checksums do not cover the other files
         return
     yield "files", 1
     if kind == "dataset":
@@ -146,7 +146,7 @@ def _verify_directory(found: FoundCard, path: str) -> Iterator[CheckResult]:
     for name in find_foreign_files(Path(path), checksums) if is_local else find_unlisted_files(path):
         full = place.where(name) if is_local else name
         yield Repair(f"{full}: {_DESKTOP}") if is_desktop_file(name) else f"{full}: is no file of this {kind}"
-    if kind == "dataset" and is_whole:  # what nobody knows is not unfolded
+    if kind == "dataset" and is_whole:  # unlisted files are not decompressed
         yield from _verify_counts(place.fetch(SAMPLES, checksums[SAMPLES]), card, where)
 
 
@@ -184,7 +184,7 @@ def _verify_map(path: Path) -> Iterator[CheckResult]:
 
 
 def _verify_store(store: Store) -> Iterator[CheckResult]:
-    """Yield what was read of all documents and payload, and a line for everything that is not as it was written."""
+    """Yield the amount read of all documents and payload, and a line for each change since they were written."""
     place, state = store.place, store.scan()
     yield from _verify_documents(place)
     yield from _verify_page(place)

@@ -23,8 +23,7 @@ from tcpipe.terrain.tiles import CACHED_TILES, MapReader, choose_level
 
 COURSES = 16
 
-_FIRST_QUARTER = ((1, 0), (2, 1), (1, 1), (1, 2))
-"""East and north in cells."""
+_FIRST_QUARTER = ((1, 0), (2, 1), (1, 1), (1, 2))  # east and north in cells
 
 
 def _list_moves() -> Ints:

@@ -60,8 +60,7 @@ CARD = "cost-map.json"
 KIND = "tcpipe cost map"
 VERSION = "1.4"
 
-_BLOCKS_KEPT = 64
-"""Blocks in a file of finished cells."""
+_BLOCKS_KEPT = 64  # blocks in a file of finished cells
 
 _QUANTITIES = {"power": "W", "velocity": "m/s", "duration": "s/m", "energy": "J/m"}
 _BAND_NAMES = tuple(f"course {angle:.1f} deg" for angle in ANGLES_DEG)

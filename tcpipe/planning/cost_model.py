@@ -69,11 +69,9 @@ def check_model(model: Model, source: MapReader, *, needs_energy: bool = True) -
 LANE_M = 0.7
 """Width of the strip that a robot needs, about the paper's Husky (0.67 m) [m]."""
 
-_ROUNDED = 1.0 + 1e-6
-"""Factor up to which a distance equals that of training [1], for rounding."""
+_ROUNDED = 1.0 + 1e-6  # factor up to which a distance equals that of training [1], for rounding
 
-_STRAY = 0.05
-"""Largest share of a lane's pixels with a wrong class [1]."""
+_STRAY = 0.05  # largest share of a lane's pixels with a wrong class [1]
 
 
 class Reason(IntFlag):

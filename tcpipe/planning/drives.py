@@ -38,7 +38,7 @@ from tcpipe.terrain.sampling import make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 
 UNCERTAIN, UNLABELLED = "position_uncertain", "no_label"
-"""Reasons against the comparison of a segment, besides `Reason`."""
+"""Reasons against the comparison of a segment, in addition to `Reason`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class DriveCost:
 
     @property
     def held_back(self) -> bool:
-        """Return whether nothing of the drive was trained on."""
+        """Return whether no part of the drive was used for training."""
         return self.samples_in_training == 0
 
 
@@ -189,7 +189,7 @@ def _list_names(reasons: Reasons) -> list[str]:
 
 
 def find_shifts(source: MapFile, recipe: Recipe, runs: Sequence[StoredRun]) -> tuple[Shifts, list[Finding]]:
-    """Return how far runs are moved on a map, and findings; nothing without ``sample.align``."""
+    """Return how far runs are moved on a map, and findings; {} without ``sample.align``."""
     if not recipe.sample.align:
         return {}, []
     registrations, findings = register_runs(runs, source, recipe)

@@ -19,8 +19,7 @@ _FARTHEST_ORIGIN_M = 100_000.0
 """From the map. A frame that begins further away has its longitude and latitude exchanged, or is of another site."""
 
 
-_SLIVER = 0.05
-"""Share of a cell at the edge of a map that makes no cell of its own."""
+_SLIVER = 0.05  # largest share of a cell at the edge of a map that gets no own cell
 
 
 def find_lonlat_projection(source: MapReader) -> Projection:
@@ -65,7 +64,7 @@ class Frame:
 
     @property
     def description(self) -> str:
-        """Return what x and y are, as one line."""
+        """Return the meaning of x and y, as one line."""
         if self.origin_deg is None:
             crs = self.source.grid.crs
             return f"x and y of {crs if len(crs) < 40 else 'the map CRS'} [m]"

@@ -56,7 +56,7 @@ class PathTotals:
     """Energy of turns beyond those of the training segments; None without the robot's physics, and for models with
     turns as input, whose energies include it."""
     duration_interval_s: tuple[float, float] | None
-    """Interval of what the robot's own sensors will measure; None, as that of energy, without held-out samples."""
+    """Interval of the value that the robot's sensors will measure; None without held-out samples, as for energy."""
     energy_interval_joule: tuple[float, float] | None
     energy_common_std_joule: float | None = None
     """Standard deviation of the sensors' measurement (gain and zero of the power sensor); in no interval."""
@@ -97,14 +97,14 @@ def compute_path_cost(
     known: MeasuredRun | None = None,
     shortest_m: float | None = None,
 ) -> PathCost:
-    """Return the cost of a path by the model, adapted by the metres of a run if one is given.
+    """Return the predicted cost of a path; the labelled segments of a run adapt the model, if they are given.
 
     Parameters
     ----------
     model, source : the model and the map.
     lonlat_deg : the path's points, WGS 84, shape (P, 2).
     where : name of the path in errors.
-    known : metres of a run of the robot that will drive the path.
+    known : labelled segments of a run of the robot that will drive the path.
     shortest_m : the least length of a path; None: that of a path segment.
 
     Raises `PathError` if the path is too short or off the map; `ModelError` if the map lacks a layer of the model.
@@ -117,10 +117,10 @@ def compute_path_cost(
     turn_rad = compute_course_changes(segments.start_xy_m, segments.end_xy_m)
     turn_radpm = turn_rad / segments.arc_m
     usual_radpm = 0.0 if model.card.physics is None else model.card.physics.mean_turn_radpm
-    turn_radpm[turn_radpm <= usual_radpm] = np.nan  # as usual: nobody drives as straight as a line is drawn
-    said = predict_segments(model, source, frames, turn_radpm)
-    said.reasons[segments.arc_m > model.card.max_arc_to_chord * segments.chord_m] |= np.uint16(Reason.CURVED)
-    return _sum_costs(model, source, segments, said, turn_rad, known)
+    turn_radpm[turn_radpm <= usual_radpm] = np.nan  # usual turns: a real path is never as straight as a drawn line
+    prediction = predict_segments(model, source, frames, turn_radpm)
+    prediction.reasons[segments.arc_m > model.card.max_arc_to_chord * segments.chord_m] |= np.uint16(Reason.CURVED)
+    return _sum_costs(model, source, segments, prediction, turn_rad, known)
 
 
 def _cut_into_segments(
@@ -153,15 +153,15 @@ def _sum_costs(  # noqa: PLR0917
     model: Model,
     source: MapReader,
     segments: PathSegments,
-    said: SegmentPredictions,
+    prediction: SegmentPredictions,
     turn_rad: Floats,
     known: MeasuredRun | None,
 ) -> PathCost:
-    class_id, errors, turning = said.terrain_class, model.errors, find_added_turning(model)
+    class_id, errors, turning = prediction.terrain_class, model.errors, find_added_turning(model)
     nothing = np.full(len(class_id), np.nan)
-    duration = segments.arc_m / said.velocity_mps
+    duration = segments.arc_m / prediction.velocity_mps
     turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, segments.arc_m, class_id)
-    energy = said.power_watt * duration + np.nan_to_num(turn_joule)
+    energy = prediction.power_watt * duration + np.nan_to_num(turn_joule)
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
     found = {
         name: Adapted(total, nothing, nothing, SumDistribution(0.0, 0.0, 0.0))
@@ -171,9 +171,9 @@ def _sum_costs(  # noqa: PLR0917
     if known is not None and errors is None:
         raise ModelError(f"{model.name}: has no error estimates, which adaptation needs; train it on more samples")
     if errors is not None:
-        begin_m, rise_m = np.cumsum(segments.arc_m), segments.arc_m * np.tan(said.slope_rad)
+        begin_m, rise_m = np.cumsum(segments.arc_m), segments.arc_m * np.tan(prediction.slope_rad)
         for name, predicted in [(name, found[name]) for name in found if name in errors]:
-            std = segments.arc_m * (said.duration_std_s if name == "duration" else said.energy_std_joule)
+            std = segments.arc_m * (prediction.duration_std_s if name == "duration" else prediction.energy_std_joule)
             near = model.find_near(compute_middles([located[place] for place in PLACES]))
             there = Metres(
                 predicted.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std, near
@@ -187,10 +187,10 @@ def _sum_costs(  # noqa: PLR0917
         **located,
         terrain_class=class_id,
         terrain_name=source.classes.names()[class_id].tolist(),
-        slope_rad=said.slope_rad,
-        cross_slope_rad=said.cross_slope_rad,
-        power_watt=said.power_watt,
-        velocity_mps=said.velocity_mps,
+        slope_rad=prediction.slope_rad,
+        cross_slope_rad=prediction.cross_slope_rad,
+        power_watt=prediction.power_watt,
+        velocity_mps=prediction.velocity_mps,
         duration_s=time.value,
         duration_low_s=time.low,
         duration_high_s=time.high,
@@ -199,8 +199,8 @@ def _sum_costs(  # noqa: PLR0917
         energy_joule=joule.value,
         energy_low_joule=joule.low,
         energy_high_joule=joule.high,
-        reasons=said.reasons,
-        reason_names=[" ".join(flag_names(int(value), Reason)) for value in said.reasons],
+        reasons=prediction.reasons,
+        reason_names=[" ".join(flag_names(int(value), Reason)) for value in prediction.reasons],
     )
     without_cost = int(table.column("duration_s").null_count)
     sums = None if errors is None else {name: adapted.total for name, adapted in found.items() if name in errors}
@@ -223,7 +223,7 @@ def _sum_costs(  # noqa: PLR0917
         energy_common_std_joule=sums["energy"].common_std if sums and "energy" in sums else None,
         held_out_samples=errors["duration"].samples if errors else 0,
         held_out_runs=errors["duration"].runs if errors else 0,
-        reasons=count_reasons(said.reasons),
+        reasons=count_reasons(prediction.reasons),
         complete=not without_cost,
     )
     return PathCost(table, totals, sums)

@@ -121,7 +121,7 @@ def predict_path(
 ) -> PathResult:
     """Return the cost of the line in a GeoJSON file; write its path segments to ``out`` and the totals beside it.
 
-    ``adapted_by`` is a run by whose labels the model is adapted.
+    ``adapted_by`` is the run whose labels adapt the model.
     """
     if out is not None:
         if out.suffix.lower() not in {".csv", ".geojson"} or out.is_dir():
@@ -192,7 +192,7 @@ class PlanResult(PlanTotals):
         return clean_lines((*lines, f"{self.out}", f"{self.nav2_path}", f"{self.nav2_waypoints}"))
 
     def _find_doubts(self) -> Iterator[Finding]:
-        """Yield what the path segments show that the cells did not."""
+        """Yield findings on path segments that the cells do not show."""
         path = Subject("file", self.out.name)
         yield from find_doubts(self, path)
         if not self.complete:
@@ -206,7 +206,7 @@ class PlanResult(PlanTotals):
 def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
     """Find the path that is asked for; write it to ``out``, and beside it messages for Nav2."""
     out = Path(options.out)
-    _check_out(out)
+    _check_output(out)
     start, goal = (np.array(end, float) for end in (options.start, options.goal))
     for label, end in (("--from", start), ("--to", goal)):
         check_lonlat(label, end[None])
@@ -226,8 +226,8 @@ def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
     return convert_record(found.totals, PlanResult, out=out, nav2_path=nav2_path, nav2_waypoints=nav2_waypoints)
 
 
-def _check_out(out: Path) -> None:
-    """Raise `UsageError` for a name that is no GeoJSON, or a file that is no plan."""
+def _check_output(out: Path) -> None:
+    """Raise `UsageError` if the output is not named as GeoJSON, or is an existing file that is not a plan."""
     if out.suffix.lower() not in {".geojson", ".json"} or out.is_dir():
         raise UsageError(f"{out}: expected the name of a file that ends in .geojson or .json")
     clear_beside(out)

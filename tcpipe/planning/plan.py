@@ -45,14 +45,11 @@ OBJECTIVES: tuple[Objective, ...] = ("energy", "time", "distance")
 DETOUR = 1.3
 """Length of a path over that of the shortest [1], up to which the search without a cost map finds the best."""
 
-_GRID = 1.03
-"""Length of a path of 16 courses over that of a straight line, at most [1]."""
+_GRID = 1.03  # length of a path of 16 courses over that of a straight line, at most [1]
 
-_GROWTH = 1.5
-"""Factor by which the ellipse grows while no path is found [1]."""
+_GROWTH = 1.5  # factor by which the ellipse grows while no path is found [1]
 
-_CAUTIONS = (0.5, 1.0, 2.0)
-"""Standard deviations of a cell that are added to its cost, for paths of little risk [1]."""
+_CAUTIONS = (0.5, 1.0, 2.0)  # standard deviations of a cell that are added to its cost, for paths of little risk [1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,7 +109,7 @@ def plan_path(
     start_deg, goal_deg : longitude and latitude, WGS 84 [deg], shape (2,).
     objective : the quantity to minimise.
     allow_extrapolation : whether to cross ground outside the training range.
-    risk : minimise what the path does not exceed with this probability; None: minimise its prediction.
+    risk : minimise the cost that the path stays below with this probability; None: minimise the predicted cost.
     budget_joule : state the probability that this energy suffices.
 
     Raises `PathError` if an end is off the map or on closed ground, or no path connects them; `ModelError` if the model
@@ -178,7 +175,7 @@ class _Search:
         return np.asarray(np.clip(row, 0, grid.rows - 1) * grid.cols + np.clip(col, 0, grid.cols - 1))
 
     def check_ends(self) -> None:
-        """Raise `PathError` for ends off the map, on closed ground, or nearer than a chord; both ends at once."""
+        """Raise `PathError` for ends off the map, on closed ground, or nearer than a chord; one error for both ends."""
         source, problems = self.survey.source, []
         labels = [
             f"--{name} {lon:.6f},{lat:.6f}" for name, (lon, lat) in zip(("from", "to"), self.ends_deg, strict=True)
@@ -234,7 +231,7 @@ class _Search:
             bound_m = max(bound_m * _GROWTH, paths[0].cost * DETOUR if paths else 0.0)
 
     def _check_open(self) -> None:
-        """Raise `PathError` for an end from which no course can be driven; both at once."""
+        """Raise `PathError` for an end from which no course can be driven; one error for both."""
         bits = self.survey.costs.reasons.reshape(COURSES, -1)[:, self._cells]
         forbidden, problems = BARRED if self.allow_extrapolation else 0xFFFF, []
         for label, own in zip(("--from", "--to"), (bits & forbidden).T, strict=True):

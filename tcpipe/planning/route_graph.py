@@ -45,7 +45,7 @@ class RouteGraphResult:
         return 3 if self.edges_without_cost else 0
 
     def __str__(self) -> str:
-        """Return what was written, and findings, as plain lines."""
+        """Return the written files, and findings, as plain lines."""
         counts = {
             "on ground outside the training range": self.unreliable_edges,
             "one-way": self.one_way_edges,

@@ -35,13 +35,11 @@ from tcpipe.terrain.layers import ClassTable
 
 Classes = Bytes
 
-_LEAST = 1e-9
-"""Least cost of a step, so that no two states precede each other."""
+_LEAST = 1e-9  # least cost of a step, so that no two states precede each other
 
 _BINS = 512
 _FLAT = 1e-9
-_STEEPEST_PER_M = 1e5
-"""Largest weight of a robot over its drive's efficiency [N]: ten tonnes."""
+_STEEPEST_PER_M = 1e5  # largest weight of a robot over its drive's efficiency [N]: ten tonnes
 
 _PRECISION = 1e-3
 
@@ -81,13 +79,13 @@ class LeastCostPath:
 
 
 def make_steps(costs: CostGrid, per_metre: Floats32, open_: Mask, metres: Floats) -> GridSteps:
-    """Return every step along every course.
+    """Return the steps from each cell along each course.
 
     Parameters
     ----------
-    costs, per_metre : the cells, and what a metre costs, shape (16, rows, cols).
+    costs, per_metre : the cells, and their cost per metre along each course, shape (16, rows, cols).
     open_ : open courses, shape (16, rows, cols); cells that a step touches only at a corner must be open, too.
-    metres : ground metres a map metre along each course, shape (16,).
+    metres : ground metres per map metre along each course, shape (16,).
     """
     known_m = costs.height_m[np.isfinite(costs.height_m)]
     merged = np.empty((*costs.height_m.shape, COURSES), np.float32)
@@ -234,8 +232,7 @@ def compute_course_changes(start_xy_m: Floats, end_xy_m: Floats) -> Floats:
     return np.asarray(0.5 * (np.append(change, 0.0) + np.insert(change, 0, 0.0)))
 
 
-_TURNS_RAD = np.radians(np.diff(np.append(ANGLES_DEG, 360.0)))
-"""From each course to the next [rad], shape (16,)."""
+_TURNS_RAD = np.radians(np.diff(np.append(ANGLES_DEG, 360.0)))  # from each course to the next [rad], shape (16,)
 
 _STEP, _LEFT, _RIGHT, _START = 1, 2, 3, 4
 """Ways by which the search reaches a state; 0: not reached."""

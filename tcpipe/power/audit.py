@@ -31,7 +31,7 @@ _SHORTEST_HALT_NS = 1_000_000_000
 
 
 def measure_rest_currents(rail: Rail, still_ns: Ints) -> Floats:
-    """Return a rail's mean current in each halt of 1 s or more [A]; ``still_ns``: begin and end [ns], shape (S, 2)."""
+    """Return a rail's mean current in each stop of 1 s or more [A]; ``still_ns``: begin and end [ns], shape (S, 2)."""
     settled = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
     settled = settled[settled[:, 1] - settled[:, 0] >= _SHORTEST_HALT_NS]
     first, last = (np.searchsorted(rail.current.stamp_ns, at_ns) for at_ns in settled.T)
@@ -41,18 +41,18 @@ def measure_rest_currents(rail: Rail, still_ns: Ints) -> Floats:
 
 
 def summarize_rest(rest_amp: Floats) -> tuple[float, float]:
-    """Return the 0.2 and 0.8 quantile of currents at rest [A]; up to a fifth of halts may be odd (slope, stuck)."""
+    """Return the 0.2 and 0.8 quantile of currents at rest [A]; a fifth of the stops may be unusual (slope, stuck)."""
     low, high = np.quantile(rest_amp, (0.2, 0.8)).tolist()
     return low, high
 
 
 def estimate_offset_std(rest_amp: Floats, rest_range_amp: tuple[float, float] | None, prior_amp: float) -> float:
-    """Return the standard deviation of a rail's zero by its currents in halts, [A], no less than the prior.
+    """Return the standard deviation of a rail's zero from its currents in stops [A], at least the prior.
 
-    If halts exceed the hardware's range by more than the prior, all offsets that explain them are equally likely. On a
-    slope the drives may draw more, so that the low halts count. If halts differ, the zero moved, and it is unknown
-    which halt is right. Without a known range an offset below the current at rest is unobservable: half of that current
-    is its standard deviation.
+    If currents in stops exceed the hardware's range by more than the prior, all offsets that explain them are equally
+    likely. On a slope the drives may draw more, so that the low currents count. If stops differ, the zero has moved,
+    and it is unknown which stop is right. Without a known range an offset below the current at rest is unobservable:
+    half of that current is its standard deviation.
     """
     if not rest_amp.size:
         return prior_amp
@@ -96,7 +96,7 @@ def measure_sag(rails: Sequence[Rail]) -> Sag | None:
     if len(stamp_ns) < _FEWEST_SAMPLES:
         return None
     values = [interpolate_rail(each, stamp_ns) for each in known]
-    if all(np.ptp(value[0]) == 0.0 for value in values):  # nobody measured a voltage
+    if all(np.ptp(value[0]) == 0.0 for value in values):  # no measured voltage
         return None
     volt, amp = np.mean([value[0] for value in values], axis=0), np.sum([value[1] for value in values], axis=0)
     rows = max(round(_WINDOW_S * 1e9 / float(np.median(np.diff(stamp_ns)))), 3)
@@ -113,7 +113,7 @@ class GainChange:
 
 
 def find_gain_change(sag: Sag | None) -> GainChange | None:
-    """Return the clearest change of the gain, by the battery's resistance; None if it is unsure or gradual."""
+    """Return the clearest change of the gain, by the battery's resistance; None if it is uncertain or gradual."""
     if sag is None:
         return None
     start_ns, by_volt, weight = _split_blocks(sag)
@@ -125,7 +125,7 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     resistance, place = -by_volt / weight, np.arange(count)
 
     def judge(first: int) -> tuple[float, float]:
-        """Return by how many variances a step explains more than a constant, and than a gradual change."""
+        """Return how much better a step fits than a constant, and than a gradual change [variances]."""
         # The level of the current steps, too, when its gain does, which disturbs the blocks beside it.
         apart = np.abs(place - first + 0.5) > 1.0
         by, at = np.sqrt(weight[apart]), place[apart]

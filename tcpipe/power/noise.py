@@ -155,7 +155,7 @@ _FEWEST = 20  # fewest second differences at a spacing: their mean square is kno
 _LOCAL_NS, _PRIOR_SAMPLES, _MIN_SCALE = 2_000_000_000, 4.0, 0.05
 """Processes near a span: time before and after it [ns], weight of the whole record in samples, least value."""
 _CALM_S, _CALM_SAMPLES = 1.5, 8
-"""Length of a calm section [s] (shorter than a halt, longer than vibration correlates), and its fewest samples."""
+"""Length of a calm section [s] (below that of a stop, above the correlation time of vibration), and fewest samples."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ known; then
 - ``averaged``: each sample is the mean since the one before it: steps;
 - ``right_endpoint``: the paper's sum V(t_i) I(t_i) Δt_i over the union's stamps, its first and last term prorated.
 
-Every rule is prorated at both ends of a span. Negative power (regeneration) counts as it is.
+Every rule is prorated at both ends of a span. Negative power (regeneration) counts as negative.
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ UNIT_VOLT = 1.0
 
 
 def is_power_only(voltage_volt: Floats) -> bool:
-    """Return whether a rail's voltages [V] say that only its power is known."""
+    """Return whether a rail's voltages [V] mark it as known by its power only."""
     return bool(len(voltage_volt)) and bool(np.all(voltage_volt == UNIT_VOLT))
 
 
@@ -68,7 +68,7 @@ class Rail:
 def make_samples(stamp_ns: Ints, value: Floats) -> SampledSignal:
     """Return the finite values in time order; of several at one stamp the first given, as for every other sensor.
 
-    Of means the second says nothing: no time lies between it and the first.
+    For means the second has no information: its interval is empty.
     """
     known = np.isfinite(value)
     stamps, first = np.unique(stamp_ns[known], return_index=True)
@@ -216,7 +216,7 @@ robot, stationary only once, for seconds, gives 12 % of that power more than the
 class IdlePower:
     """Idle power of a run: median of the means of seconds [W], and its σ for any second of the run; NaN if unknown.
 
-    ``highest_watt``: highest median of a halt from 1 s after its start, when motors no longer brake, plus three steps
+    ``highest_watt``: highest median of a stop from 1 s after its start, when motors no longer brake, plus three steps
     of the record.
     """
 
@@ -231,7 +231,8 @@ def estimate_idle_power(power_watt: Floats, halt: Ints, *, window_rows: int, ste
     Parameters
     ----------
     power_watt : [W], shape (N,), while the robot is stationary, in order of time; NaN where unknown.
-    halt : shape (N,), number of the row's halt, increasing; negative at the edges of a halt, where motors may draw.
+    halt : shape (N,), number of the row's stop, increasing; negative at the edges of a stop, where motors may draw
+        current.
     window_rows : rows of a second.
     step_watt : [W], resolution of power; a record that stays on one level has an error of up to half of it.
     """
@@ -254,7 +255,7 @@ def estimate_idle_power(power_watt: Floats, halt: Ints, *, window_rows: int, ste
 
 
 def _split_halts(halts: list[Floats], rows: int) -> list[Floats]:
-    """Return halts in parts of ``rows`` rows or slightly more, without parts of less than half unless all are."""
+    """Split stops into parts of at least ``rows`` rows; parts of less than half are left out unless all are."""
     parts = [part for each in halts for part in np.array_split(each, max(each.size // rows, 1))]
     return [part for part in parts if 2 * part.size >= rows] or parts
 

@@ -33,7 +33,7 @@ _JUMPING_SHARE = 0.1  # smallest share of changes by more than one level
 
 
 def find_readings(stamp_ns: Ints, values: Floats) -> Ints | None:
-    """Return the rows on which new readings arrived, shape (R,); None where messages do not surely repeat readings.
+    """Return the rows on which new readings arrived, shape (R,); None if messages do not certainly repeat readings.
 
     A reading equal to the one before it shows no change: its row is where it is expected. ``stamp_ns`` [ns], shape
     (N,), does not decrease; ``values``, shape (N, K), finite, are quantities that are read together.
@@ -97,9 +97,9 @@ def _find_arrivals(at_ns: Floats, changed: Ints, *, period_ns: float, message_ns
 
 
 _FEWEST = 60
-_LATE = np.linspace(-1.0, 1.5, 26)  # delays that are tried, in periods: 0 is a sample's, a half is a mean's
+_DELAYS = np.linspace(-1.0, 1.5, 26)  # delays that are tried, in periods: 0 is a sample's, a half is a mean's
 _NEAR = 0.25
-_CLEARLY = 0.9  # the better of two delays says so when its squared residuals are below this share of the other's
+_MAX_RESIDUAL_RATIO = 0.9  # largest ratio of squared residuals at which the better delay is accepted
 
 
 def is_stated_averaged(
@@ -108,8 +108,8 @@ def is_stated_averaged(
     """Return whether values are means since the one before (True) or samples (False); None if motion shows neither.
 
     Power is fitted by a constant, speed, its square, turning and the gain of speed, as means over one period about a
-    delay before each stamp. The delay that fits best decides, unless it fits neither case, or hardly better than the
-    other.
+    delay before each stamp. The delay that fits best decides, unless it fits neither case, or only slightly better than
+    the other.
 
     Parameters
     ----------
@@ -123,10 +123,10 @@ def is_stated_averaged(
     fit = make_power_fit(power, motion_ns, motion, averaged=False, margin_s=2.0 * period_s)
     if fit is None:
         return None
-    left = np.array([fit.fit_means(late * period_s, period_s).sum() for late in _LATE])
-    best = _LATE[int(np.argmin(left))]
-    sampled, averaged = (float(np.interp(late, _LATE, left)) for late in (0.0, 0.5))
-    if min(abs(best), abs(best - 0.5)) > _NEAR or min(sampled, averaged) > _CLEARLY * max(sampled, averaged):
+    left = np.array([fit.fit_means(late * period_s, period_s).sum() for late in _DELAYS])
+    best = _DELAYS[int(np.argmin(left))]
+    sampled, averaged = (float(np.interp(late, _DELAYS, left)) for late in (0.0, 0.5))
+    if min(abs(best), abs(best - 0.5)) > _NEAR or min(sampled, averaged) > _MAX_RESIDUAL_RATIO * max(sampled, averaged):
         return None
     return averaged < sampled
 

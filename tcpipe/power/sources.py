@@ -116,7 +116,7 @@ BATTERY_STATE = "sensor_msgs/msg/BatteryState"
 _PERCENTAGE = "percentage"
 
 FLOAT_TYPES = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
-"""A voltage or a current alone; the topic's name says which."""
+"""Types of a single voltage or current; the topic's name determines which."""
 
 
 def find_sources(
@@ -166,7 +166,7 @@ _CORRECTED = "_corrected"
 
 
 def find_quantity(topic: str) -> Literal["voltage", "current"] | None:
-    """Return what a bare number on a topic is, by the topic's last word that says so."""
+    """Return the quantity of a plain number on a topic, from the last word of its name that states one."""
     found = _QUANTITY.findall(topic.lower())
     if not found:
         return None
@@ -179,7 +179,7 @@ def make_rail_name(topic: str) -> str:
 
 
 def is_of_drives(topic: str) -> bool:
-    """Whether a topic's name says that it is of what drives, rather than of a whole battery."""
+    """Return whether a topic's name indicates the drives, rather than a whole battery."""
     return re.search(r"drive|motor|traction|wheel|esc(?![a-z])|inverter", topic.lower()) is not None
 
 
@@ -202,7 +202,7 @@ def is_corrected(topic: str) -> bool:
 
 
 def _make_float_source(type_name: str, topic: str) -> list[list[PowerSource]] | Finding:
-    """Return the source of a bare number, by its topic's name."""
+    """Return the source of a plain number, by its topic's name."""
     what = find_quantity(topic)
     if what is None:
         return reject_power(topic, "quantity-unknown", names={"type": type_name})
@@ -306,7 +306,7 @@ def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReading
 
 
 _FROZEN_NS, _FEWEST_EQUAL = 5_000_000_000, 20
-_MOVES = 0.5  # share of the range of 90 % of a current: a current that changes by more is driven
+_MIN_MOVE_SHARE = 0.5  # share of the range of 90 % of a current: a current that changes by more is driven
 _BESIDE, _CROWDED = 20, 10.0
 """Levels next to the end of a range, and least count at the end of a clipped current over that of such a level."""
 
@@ -346,7 +346,7 @@ def _is_frozen(values: Floats, others: Floats, stamp_ns: Ints) -> Mask:
     if is_long.any() and others.size:
         low, high = np.nanquantile(others, (0.05, 0.95), axis=0)
         for begin, end in zip(first[is_long], last[is_long] + 1, strict=True):
-            frozen[begin:end] = (np.ptp(others[begin:end], axis=0) > _MOVES * (high - low)).any()
+            frozen[begin:end] = (np.ptp(others[begin:end], axis=0) > _MIN_MOVE_SHARE * (high - low)).any()
     return frozen
 
 
@@ -415,7 +415,7 @@ def read_values(columns: Columns, field: FieldPath) -> Floats:
 def find_rejection(rail: RailReadings, topic: str, columns: Columns) -> Finding | None:
     """Return why a rail's numbers cannot be power, with the evidence, or None where they can.
 
-    Each rule needs every row to agree, or the median; a single odd row is no evidence.
+    Each rule needs every row to agree, or the median; a single deviating row is no evidence.
     """
     voltage, current = (values[np.isfinite(values)] for values in (rail.voltage_volt, rail.current_amp))
     live = voltage[voltage > 0.0]

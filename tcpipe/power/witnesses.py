@@ -186,7 +186,7 @@ RESISTANCE_OHM = "battery_ohm"
 
 
 def compare_batteries(runs: Iterable[tuple[str, str, Iterable[Finding]]]) -> Iterator[Finding]:
-    """Yield each run whose battery has another resistance than the other runs of its robot.
+    """Yield a finding for each run whose battery differs in resistance from the other runs of its robot.
 
     ``runs``: run, robot and findings of each. The voltage sags in proportion to the current, so that another scale of a
     run's current shows as another resistance.
@@ -199,7 +199,7 @@ def compare_batteries(runs: Iterable[tuple[str, str, Iterable[Finding]]]) -> Ite
     most, most_of_batteries = (read_threshold(_BATTERY, name) for name in ("max_ratio", "max_ratio_of_batteries"))
     for robot, by_run in by_robot.items():
         for run_id, ohm in by_run.items():
-            # Two runs are compared with each other; of three or more, a single odd run does not make the others odd.
+            # Two runs are compared with each other; of three or more, one deviating run does not affect the others.
             compared = [other for other_id, other in by_run.items() if other_id != run_id or len(by_run) != 2]
             ratio = ohm / float(np.median(compared))
             excess = max(ratio, 1.0 / ratio)

@@ -20,25 +20,25 @@ from tcpipe.tables.findings import omit
 
 Role = Literal["gnss", "gnss_velocity", "imu", "wheel_odometry", "visual_odometry", "power", "command", "pose"]
 MappedRole = Literal["gnss", "gnss_velocity", "imu", "wheel_odometry", "visual_odometry", "command", "pose"]
-"""Roles whose messages can be mapped; power has tables of its own, [[power_sources]]."""
+"""Roles whose messages can be mapped; power has its own tables, [[power_sources]]."""
 MadeFrom = Literal["imu", "wheel_odometry", "visual_odometry"]
 FixQuality = Literal["rtk_fixed", "rtk_float", "differential", "single"]
 Fraction = Annotated[float, Bounds(ge=0, le=1)]
 Deviation = Annotated[float, Bounds(ge=1e-6, le=1e3)]
-"""A standard deviation or noise: a millionth is lost beside what it is added to, a thousand weighs nothing."""
+"""Bounds of a standard deviation or noise: smaller values have no effect in sums, larger ones no weight."""
 Limit = Annotated[float, Bounds(ge=1e-6, le=1e3)]
-"""A speed, rate, acceleration or radius that something is compared with: beyond, all or nothing passes."""
+"""Bounds of a threshold of speed, rate, acceleration or radius: beyond them, all or no values pass."""
 Window = Annotated[float, Bounds(ge=0.01, le=60)]
 """Time that one motion takes [s]: less than any sensor's period, more than any manoeuvre."""
 Gap = Annotated[float, Bounds(ge=0.01, le=3600)]
-"""Time without messages [s]: less than any sensor's period, more than odometry holds."""
+"""Bounds of a time without messages [s]: from less than any sensor's period to more than odometry stays accurate."""
 Widening = Annotated[float, Bounds(ge=0, le=600)]
 """Time around an event that is dropped with it [s]."""
 ArcToChord = Annotated[float, Bounds(ge=1, le=10)]
 """Length of an arc over that of its chord: 1 is straight, 1.57 a half circle."""
 Metres = Annotated[float, Bounds(ge=-1000, le=1000)]
 Tolerance = Annotated[float, Bounds(ge=0, le=10)]
-"""A standard deviation of a stated place [m]: 0 is exact, more than the robot says nothing."""
+"""Bounds of the σ of a stated position [m]: 0 is exact; values above the robot's size have no meaning."""
 Radians = Annotated[float, Bounds(ge=-6.3, le=6.3)]
 """An angle: one turn either way; more is mostly degrees."""
 Offset = Annotated[float, Bounds(ge=-2e9, le=2e9)]
@@ -144,7 +144,7 @@ class FuseConfig(_Section):
 
 @dataclass(frozen=True, slots=True)
 class TimeWindow:
-    """A span of a run that is kept, and nothing beside such spans, or dropped."""
+    """A span of a run that is dropped, or kept (then only such spans are kept)."""
 
     run: str = "*"
     """Pattern of the runs: the name of the log, or a run_id; * is any text."""
@@ -156,7 +156,7 @@ class TimeWindow:
     """The same; default: the end of the track."""
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Yield each key whose value cannot be, and what was wanted."""
+        """Yield each key with an invalid value, and the expected value."""
         is_read = True
         for key in ("start", "end"):
             try:

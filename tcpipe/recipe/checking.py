@@ -69,7 +69,7 @@ def read_annotations(cls: type) -> Mapping[str, Any]:
 def describe(*kinds: Any, file: str = "") -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
     """Return the JSON Schema of each annotation, and its definitions; docstrings describe dataclasses and keys.
 
-    ``file`` holds the definitions; "" is the file of the schema itself.
+    ``file`` contains the definitions; "" is the file of the schema itself.
     """
     template, text = f"{file}#/$defs/{{name}}", {"type": "string"}
     schemas, definitions = msgspec.json.schema_components(kinds, schema_hook=lambda _: text, ref_template=template)
@@ -121,7 +121,7 @@ def _format_range(schema: Mapping[str, Any]) -> str:
 
 
 def _format_schema(schema: Mapping[str, Any]) -> str:
-    """Return what a JSON Schema asks for."""
+    """Return the expectation of a JSON Schema as text."""
     match schema:
         case {"anyOf": [first, *_]}:
             return _format_schema(first)
@@ -139,7 +139,7 @@ TO_MEASURE = "?"
 
 
 def as_toml(value: Any) -> str:
-    """Return a value as TOML writes it; `TO_MEASURE` as it is."""
+    """Return a value in TOML; `TO_MEASURE` unchanged."""
     if isinstance(value, bool | str):
         text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
         return TO_MEASURE if value == TO_MEASURE else text
@@ -163,7 +163,7 @@ def parse_utc_ns(text: str) -> int:
 
 
 def _check_value(kind: Any, value: Any, key: str, problems: list[str]) -> Any:
-    """Return the plain value of an annotation; what is wrong becomes a problem."""
+    """Return the plain value of an annotation; errors become problems."""
     origin, arguments = get_origin(kind), get_args(kind)
     if is_dataclass(kind):
         return _find_dataclass(kind, value, key, problems)

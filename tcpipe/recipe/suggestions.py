@@ -52,7 +52,7 @@ class RecipeFragment:
 
 
 def make_place_to_measure(role: str) -> Keys:
-    """Return the extrinsics of a sensor as keys whose values the user must measure; an antenna has no rotation."""
+    """Return the extrinsics of a sensor as keys with values for the user to measure; an antenna has no rotation."""
     return dict.fromkeys(("xyz_m",) if role == "gnss" else ("xyz_m", "rpy_rad"), (TO_MEASURE,) * 3)
 
 
@@ -75,7 +75,7 @@ def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Rem
 
 @cache
 def format_recipe_key(name: str) -> str:
-    """Return the dotted name of a key whose value only the reader knows, for messages; `RecipeError` if unknown."""
+    """Return the dotted name of a key that only the user can fill in, for messages; `RecipeError` if unknown."""
     section, _, key = name.partition(".")
     known = read_annotations(Recipe)
     if section not in known or (key and key not in read_annotations(known[section])):

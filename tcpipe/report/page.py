@@ -96,7 +96,7 @@ class Shaded:
 
 @dataclass(frozen=True, slots=True)
 class ShownFinding:
-    """The findings of one code: what it means, what was observed and when, and what helps, with the lines to copy."""
+    """The findings of one code: meaning, observations with times, and remedies with lines to copy."""
 
     severity: Severity
     code: str
@@ -243,7 +243,7 @@ def _format_json(name: str, value: Json) -> str:
 
 
 def _clean_data(value: Json) -> Json:
-    """Return plain data with every text as one line that can be seen whole."""
+    """Return plain data with every text as one printable line."""
     if isinstance(value, str):
         return value if value.isprintable() else clean_line(value)
     if value is None or isinstance(value, int | float):
@@ -282,7 +282,7 @@ def pack_columns(columns: Mapping[str, Column]) -> Json:
 
 
 def make_shown_column(digits: int, values: Floats) -> Column:
-    """Return a column that is shown with so many decimals: in steps where these are finer than half of the last one."""
+    """Return a column with a number of decimals: in steps where these are finer than half of the last one."""
     return ("steps" if _scale(values)[1] < 0.5 * 10.0**-digits else "f32"), values
 
 

@@ -29,7 +29,7 @@ _CIVIDIS = np.array([[0, 34, 78], [65, 77, 107], [124, 123, 120], [188, 175, 111
 
 
 def make_picture_uri(pixels: Bytes, *, exact: bool = False) -> str:
-    """Return a picture, grey (R, C) or colour (R, C, 3), as a data URI; ``exact`` keeps every pixel as it is."""
+    """Return a picture, grey (R, C) or colour (R, C, 3), as a data URI; ``exact`` keeps every pixel unchanged."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, format="WEBP", quality=78, lossless=exact, method=4)
     return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"

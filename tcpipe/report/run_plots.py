@@ -22,7 +22,7 @@ MOST_VALUES = 80_000
 """Most values of a series on the page; longer series are thinned."""
 
 _GAP_PERIODS = 10
-"""A line is not drawn over so many periods without a value."""
+"""Periods without a value that interrupt a line."""
 
 _BETWEEN_EPOCHS_S = 1.0
 
@@ -301,7 +301,7 @@ def time_plots(
         legend = colours if len(colours) > 1 else {}
         plot = _draw_panel(name, f"{name} [{_UNITS[name]}]", first, legend=legend)
         places = [f"line {len(lines_json) + number}" for number in range(len(colours))]
-        for place, colour in reversed(list(zip(places, colours.values(), strict=True))):  # the first lies on top
+        for place, colour in reversed(list(zip(places, colours.values(), strict=True))):  # the first is drawn on top
             ends = {"t": [0.0, 1.0], "y": [0.0, 1.0]}  # until the page's script has unpacked the series
             plot.figure.line("t", "y", color=colour, line_width=1.3, source=ends, name=place)
         fields = ("plot", "name", "series", "column", "colour", "unit")
@@ -349,7 +349,7 @@ def _draw_panel(name: str, label: str, first: Plot, *, legend: Mapping[str, str]
 
 def _draw_masks(timeline: Timeline, spans: Mapping[str, Column], findings: Sequence[FindingSpan]) -> Plot:
     """Return the plot of findings, kept rows, and reasons for dropping the others; all plots share its time axis."""
-    least_s = 0.004 * timeline.end_s  # so that a moment can be seen
+    least_s = 0.004 * timeline.end_s  # so that short events are visible
     events = [
         (one.code, start_s, max(end_s, start_s + least_s), SEVERITY_COLOURS[one.severity], describe_finding(one))
         for one, start_s, end_s in findings

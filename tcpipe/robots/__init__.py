@@ -1,6 +1,6 @@
 """Profiles of robots and of messages with their power: TOML files in this folder, read by `tcpipe.formats.recipe_toml`.
 
-A recipe holds the same tables, ``[robots.NAME]`` and ``[[power_sources]]``; they go before these.
+A recipe may contain the same tables, ``[robots.NAME]`` and ``[[power_sources]]``, which have priority.
 
 Robots and power sources as plain records: one schema for the package's own TOML files and for a recipe's tables.
 """
@@ -41,7 +41,7 @@ TORQUE_GAIN_STD_FRACTION, LOSS_STD_FRACTION = 0.1, 0.3
 constant (data sheets: ± 10 %), and of a stated loss: copper's resistance rises by 0.39 % a kelvin."""
 
 TABLE_POWER = "tcpipe/msg/TablePower"
-"""The type of a table of power, where that is neither a voltage nor a current as it stands."""
+"""The type of a table of power, if it is neither a plain voltage nor a plain current."""
 
 UNMEASURED_AMP = {
     "battery_status": (-1.0,),
@@ -52,7 +52,7 @@ registers, of either sign, may be real: they count only if both neighbours are f
 are never a measurement."""
 
 GENERIC = "generic"
-"""The name of a robot of which nothing is known."""
+"""Name of an unknown robot."""
 
 MAX_PLAUSIBLE_MPS = 15.0
 """No ground robot that records terrain costs is faster [m/s]: a faster track is an estimate that went astray."""
@@ -108,7 +108,7 @@ class Robot:
     """Words in topic names that identify this robot; whole words, in lower case."""
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Yield each key whose value cannot be, and what was wanted."""
+        """Yield each key with an invalid value, and the expected value."""
         for key, what in (("voltage_range_volt", "voltages"), ("power_range_watt", "powers")):
             limits = getattr(self, key)
             if limits is not None and limits[0] >= limits[1]:
@@ -207,7 +207,7 @@ class PowerSource:
         return self.offset_std_watt if self.lacks_voltage else self.offset_std_amp
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Yield each key whose value cannot be, and what was wanted."""
+        """Yield each key with an invalid value, and the expected value."""
         if not _TYPE.fullmatch(self.type):
             yield "type", "package/msg/Name"
         yield from self._field_contradictions([key for key in _QUANTITIES if getattr(self, key)])

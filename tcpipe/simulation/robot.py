@@ -36,13 +36,13 @@ _GROUND = {
 
 @dataclass(frozen=True, slots=True)
 class Wheels:
-    """Four wheels without suspension, and what uneven and sidelong ground costs them."""
+    """Four wheels without suspension, and their losses on uneven and side-sloping ground."""
 
     track_m: float  # from left to right
     contact_m: float  # length of a wheel's contact, over which bumps are averaged
     bump_loss: float  # share of the height climbed at bumps that is not given back
     cornering_per_rad: float
-    """Side force per slip angle, over the normal force: on a slope the wheels run sidelong by so much that it holds."""
+    """Side force per slip angle, over the normal force: on a side slope the wheels slip until the force balances it."""
     slowdown: float  # speed lost by a rolling resistance beyond the class's, as a fraction of speed over one of weight
 
 
@@ -76,7 +76,7 @@ class SimulatedRobot:
     ground: dict[int, GroundModel] = field(default_factory=lambda: dict(_GROUND))
     """By class id; a class that is not named is grass."""
     wheels: Wheels | None = omit()
-    """None: the ground under the robot's middle counts, and its bumps and slope across cost nothing."""
+    """None: the ground under the robot's middle counts, and bumps and side slopes cost nothing."""
 
     def ground_table(self) -> Floats:
         """Return speed, slip and rolling resistance by class id, shape (256, 3)."""

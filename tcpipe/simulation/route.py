@@ -45,7 +45,7 @@ class Reverse:
 
 @dataclass(frozen=True, slots=True)
 class Pause:
-    """Stand still."""
+    """Stay stationary for a time."""
 
     duration_s: float
 
@@ -84,7 +84,8 @@ class Path:
 def make_leg_path(start_m: Floats, leg: Leg, *, weave: tuple[Floats, Floats, Floats], weave_m: float) -> Path:
     """Return the curve of ``leg`` from ``start_m``, shape (2,), in the coordinates of its waypoints.
 
-    ``weave`` holds wavelengths [m], phases [rad] and weights of the sideways weaving, of total amplitude ``weave_m``.
+    ``weave`` contains wavelengths [m], phases [rad] and weights of the sideways weaving, of total amplitude
+    ``weave_m``.
     """
     corners = np.vstack([start_m, np.asarray(leg.waypoints_m, dtype=float)])
     curvature, straight_m = _compute_curvature(corners, leg.radius_m)
@@ -268,8 +269,7 @@ STEP_NS = 5_000_000
 _DT_S = STEP_NS * 1e-9
 _BRAKE_BEFORE_M = 0.5
 _SMALL_TURN_RAD = 1e-6
-_DIGGING_RESISTANCE = 0.3
-"""Rolling resistance of wheels that turn while the robot is stuck [1]."""
+_DIGGING_RESISTANCE = 0.3  # rolling resistance of wheels that turn while the robot is stuck [1]
 
 
 @dataclass(frozen=True, slots=True)

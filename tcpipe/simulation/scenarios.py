@@ -48,7 +48,7 @@ _BETWEEN_DRIVES_NS = 3_600_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class DriveSpec:
-    """One drive: where it goes, what records it, what is wrong with that."""
+    """One drive: its route, its sensors, and their faults."""
 
     name: str
     plan: tuple[Manoeuvre, ...] | Wander | AlongRoad
@@ -119,7 +119,7 @@ def make_small_world(site: Site | None = None) -> World:
 def _make_visible_world() -> World:
     """Return the small world as a drone sees it one morning: sunlit, wet here and there, with a wood and a hedge.
 
-    They stand within 5 m of the border, where no drive goes: these are the drives of the small world.
+    Trees and hedges are within 5 m of the border, away from all drives, which are those of the small world.
     """
     world = make_small_world()
     edges = (
@@ -167,7 +167,7 @@ def make_paper_site() -> PaperSite:
 
 
 def make_paper_surface() -> Surface:
-    """Return what the ground is like from metre to metre."""
+    """Return the variation of the ground from metre to metre."""
     parameters = read_paper_parameters()
     states = parameters["states"]
     fields = (

@@ -1,4 +1,4 @@
-"""Simulated sensors: what each measures of the truth, and when the recorder receives it.
+"""Simulated sensors: their measurements of the truth, and the times at which the recorder receives them.
 
 A sensor samples at its own rate and phase. Its reading contains the time of measurement in the header, the time of
 recording, and columns in SI units in the sensor's own frame. Each sensor and fault has a named random stream.
@@ -35,7 +35,7 @@ class Faults:
     gnss_noise: bool = False  # position noise, most of it correlated in time
     gnss_lever_arm: bool = False  # the antenna is not at base_link
     gnss_outliers: bool = False  # multipath: some fixes are metres off, with the same covariance
-    gnss_outage: bool = False  # no fix for ten seconds (half of it said with status -1, half in silence)
+    gnss_outage: bool = False  # no fix for ten seconds (half with status -1, half without messages)
     gnss_stamp_jitter: bool = False  # the stamp is not quite the time of measurement
     wheel_noise: bool = False  # white noise of speed and yaw rate
     wheel_scale: bool = False  # a wrong wheel radius, and a yaw rate that a skid-steered robot overstates
@@ -48,9 +48,9 @@ class Faults:
     visual_noise: bool = False  # white noise of the velocity
     visual_scale: bool = False  # a wrong scale
     visual_outliers: bool = False  # single frames that are far off
-    visual_dropouts: bool = False  # stretches without visual odometry
+    visual_dropouts: bool = False  # spans without visual odometry
     power_noise: bool = False  # white noise and quantisation of voltage and currents
-    power_gap: bool = False  # a stretch without power messages
+    power_gap: bool = False  # a span without power messages
     command_jitter: bool = False  # a joystick that is never still
     transport_delay: bool = False  # messages reach the recorder late, each by another time
     duplicates: bool = False  # some messages are recorded twice
@@ -194,7 +194,7 @@ class Power:
     voltage_step_volt: float = 0.01
     current_step_amp: float = 0.05
     gap_s: float = 1.5
-    electronics_watt: float = 38.0  # what computer and user ports draw; reported apart
+    electronics_watt: float = 38.0  # power of computer and user ports, reported separately
     delay_s: float = 0.01
     clock_offset_s: float = 0.25
 
@@ -338,7 +338,9 @@ def read_wheels(truth: Truth, sensor: WheelOdometry, faults: Faults, noise: Nois
         velocity, yaw_rate = velocity * sensor.scale, yaw_rate * sensor.yaw_scale
     if faults.wheel_noise:
         rng = noise("wheels.noise")
-        turning = (np.abs(velocity) > 1e-6) | (np.abs(yaw_rate) > 1e-6)  # standing encoders are exactly still
+        turning = (np.abs(velocity) > 1e-6) | (
+            np.abs(yaw_rate) > 1e-6
+        )  # encoders of a stationary robot are exactly constant
         velocity = velocity + turning * sensor.std_mps * rng.standard_normal(stamp.size)
         yaw_rate = yaw_rate + turning * sensor.yaw_rate_std_radps * rng.standard_normal(stamp.size)
     x, y, yaw = _dead_reckon(velocity, yaw_rate, 1.0 / sensor.rate_hz)
@@ -473,7 +475,7 @@ def _draw_begin_ns(truth: Truth, rng: np.random.Generator, length_s: float) -> i
 
 
 def _remove_stretch(stamp: Ints, truth: Truth, rng: np.random.Generator, length_s: float) -> Mask:
-    """Return which messages are left when some stretch of that length is missing."""
+    """Return the remaining messages if a span of this length is missing."""
     begin = _draw_begin_ns(truth, rng, length_s)
     return (stamp < begin) | (stamp >= begin + round(length_s * 1e9))
 

@@ -55,7 +55,7 @@ class SimulatedSite:
 def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> SimulatedSite:
     """Write a simulated site to ``out``, whole or not at all, unless it exists; bytes follow from scenario and seed.
 
-    Raises `UsageError`: the scenario is unknown, or ``out`` holds something else.
+    Raises `UsageError`: the scenario is unknown, or ``out`` has other content.
     """
     chosen = scenario_by_name(scenario) if isinstance(scenario, str) else scenario
     about = {"seed": seed, "datum": chosen.world.site.datum, "scenario": chosen, "tcpipe_version": __version__}
@@ -91,7 +91,7 @@ def _read_site(out: Path, scenario: Scenario) -> SimulatedSite:
 
 
 def simulate_readings(scenario: Scenario, index: int = 0, *, seed: int = 1) -> tuple[Truth, dict[str, Reading]]:
-    """Return the truth of one drive of a scenario, and what its sensors said; nothing is written."""
+    """Return the truth of one drive of a scenario, and its sensor messages; nothing is written."""
     spec, noise = scenario.drives[index], Noise(seed, index)
     plan = spec.plan if isinstance(spec.plan, tuple) else spec.plan.plan(scenario.world, noise("plan"))
     truth = simulate_drive(
@@ -103,7 +103,7 @@ def simulate_readings(scenario: Scenario, index: int = 0, *, seed: int = 1) -> t
 
 
 def simulate_messages(scenario: Scenario, index: int = 0, *, seed: int = 1) -> tuple[Truth, list[MessageStream]]:
-    """Return the truth of one drive of a scenario, and what is recorded of it; nothing is written."""
+    """Return the truth of one drive of a scenario, and its recorded messages; nothing is written."""
     spec, (truth, readings) = scenario.drives[index], simulate_readings(scenario, index, seed=seed)
     stated = spec.sensors.mounted(spec.faults).stated(spec.faults, Noise(seed, index))
     return truth, make_streams(readings, stated, spec.recorder)

@@ -21,7 +21,7 @@ _COMPONENTS = {
 
 @dataclass(frozen=True)
 class Truth:
-    """One drive at 200 Hz; all arrays have one row a step, and base_link stands on the ground.
+    """One drive at 200 Hz; all arrays have one row a step, and base_link is on the ground.
 
     The local plane is ENU at the site's origin; ``quat_xyzw``: enu_from_base_link; velocities are of base_link.
     """

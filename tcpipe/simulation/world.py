@@ -96,7 +96,7 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class Wave:
-    """A plane wave: amplitude in the unit of what it ripples."""
+    """A plane wave: amplitude in the unit of its field."""
 
     amplitude: float
     wavelength_m: float
@@ -183,7 +183,7 @@ class Surface:
     swing: float  # by how much grain, bumps and ridges grow where their state is 1, as a fraction
 
     def shade(self, classes: Bytes, u: Floats, v: Floats) -> Floats:
-        """Return what the brightness is multiplied with, at offsets from the site's corner [m]."""
+        """Return the factor of brightness at offsets from the site's corner [m]."""
         grain = 1.0 + self.swing * state(self.cover, u, v)
         grain *= self._by_class("grain")[classes] * evaluate_field(self.grain, u, v)
         return (1.0 - self._by_class("wet_shade")[classes] * state(self.wetness, u, v)) * (1.0 + grain)
@@ -212,7 +212,7 @@ _COLOUR = np.array([
     [0, 0, 0], [120, 60, 56], [32, 52, 30], [58, 84, 44],
     [96, 134, 62], [104, 82, 58], [168, 150, 122], [122, 124, 128],
 ], dtype=float)  # fmt: skip
-"""RGB by class id; 0 is nothing."""
+"""RGB by class id; 0 is no data."""
 
 _SOFT_BORDER_M = 0.3
 
@@ -280,7 +280,7 @@ class Band:
         return np.asarray(self.width_m / 2.0 - np.abs(offset) / np.hypot(1.0, self.amplitude_m * k * np.cos(angle)))
 
     def may_touch(self, box: Box) -> bool:
-        """Compare the straight strip that holds the band with the box."""
+        """Return whether the straight strip around the band overlaps the box."""
         c, s = np.cos(self.direction_rad), np.sin(self.direction_rad)
         u, v = (box[0] + box[2]) / 2 - self.x_m, (box[1] + box[3]) / 2 - self.y_m
         reach = abs(s) * (box[2] - box[0]) / 2 + abs(c) * (box[3] - box[1]) / 2
@@ -296,8 +296,8 @@ class World:
     base_m: float  # height above the geoid without hills [m]
     hills: tuple[Hill, ...] = ()
     waves: Waves = ()  # ripples of the height [m]
-    regions: tuple[Ellipse | Band, ...] = ()  # later ones lie on earlier ones; the rest is grass
-    holes: tuple[Ellipse, ...] = ()  # where the rasters hold nothing (the white areas of the paper's figure 1)
+    regions: tuple[Ellipse | Band, ...] = ()  # later classes cover earlier ones; all other ground is grass
+    holes: tuple[Ellipse, ...] = ()  # areas without data in the rasters (white in the paper's figure 1)
     texture: Waves = ()  # ripples of the brightness, as a fraction
     resistance: Waves = field(default=())
     """Ripples of the rolling resistance that no map shows, as a fraction."""
@@ -365,7 +365,7 @@ class World:
         return rgb * shade[..., None]
 
     def mapped(self, x_map_m: Floats, y_map_m: Floats) -> Mask:
-        """Return whether the rasters hold data here."""
+        """Return whether the rasters have data here."""
         u, v = self.site.uv_m(x_map_m, y_map_m)
         inside = (u >= 0) & (u <= self.site.width_m) & (v >= 0) & (v <= self.site.height_m)
         for hole in self._near(self.holes, u, v):

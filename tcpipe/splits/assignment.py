@@ -99,11 +99,11 @@ def draw_groups(groups: Groups, arrival: Ints, *, test_fraction: float, seed: in
     order = sort_by_rank(groups.names, seed=seed, purpose="test")
     for sizes in _iterate_sizes(groups, arrival):
         free = order[sizes[order] > 0]
-        _take(tests, free, sizes, wanted=test_fraction * float(sizes.sum()))
+        _add_test_groups(tests, free, sizes, wanted=test_fraction * float(sizes.sum()))
     return tests
 
 
-def _take(tests: Mask, free: Ints, sizes: Ints, *, wanted: float) -> None:
+def _add_test_groups(tests: Mask, free: Ints, sizes: Ints, *, wanted: float) -> None:
     """Add groups in ``free``, sorted by rank, to ``tests`` while that brings their share nearer to ``wanted``."""
     has_samples = sizes > 0
     taken, left = int(sizes[tests].sum()), int((has_samples & ~tests).sum())

@@ -14,12 +14,12 @@ Ints = NDArray[np.signedinteger]
 
 _CONTACT_FRACTION = 1e-3  # footprints that share less of their area than this touch; consecutive segments always do
 
-_CHUNK = 4_096  # footprints looked at together: each may be near hundreds of others
+_CHUNK = 4_096  # footprints per query: each may be near hundreds of others
 
 _PAIRS = 65_536  # pairs that are geometries at one time (1 kB each)
 
 CLOSE = 1.05
-"""Ground nearer than so many chords to a training sample counts as covered: consecutive samples are one chord apart."""
+"""Distance to a training sample up to which ground counts as covered [chords]: consecutive samples are one apart."""
 
 PLACES = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
 """Columns of a chord's ends."""
@@ -107,7 +107,7 @@ def compute_middles(ends: Sequence[GenericArray]) -> Floats:
 
 
 def are_near(queries: Floats, references: Floats, *, within_m: float, in_degrees: bool) -> Mask:
-    """Return which of ``queries``, shape (N, 2), are at most so far from one of ``references``; NaN is near nothing.
+    """Return which of ``queries``, shape (N, 2), are within a distance of one of ``references``; NaN is near none.
 
     Both are lon, lat [deg] if ``in_degrees``, else x, y [m].
     """

@@ -28,7 +28,7 @@ _PIECE_EDGES = 16  # edges of a piece of a border
 
 
 class Side(IntEnum):
-    """Where a footprint lies."""
+    """Region of a footprint."""
 
     INSIDE = 0
     """In a train_test region: trains or tests."""
@@ -112,7 +112,7 @@ def _cut_lines(borders: BaseGeometry) -> NDArray[np.object_]:
 
 
 def _is_on_border(squares: NDArray[np.object_], borders: shapely.STRtree, *, buffer_m: float) -> Mask:
-    """Tell which squares a border runs through, or passes nearer than the buffer."""
+    """Return which squares are crossed by a border, or nearer to it than the buffer."""
     found = np.zeros(len(squares), bool)
     if buffer_m > 0.0:
         (square, _), distance_m = borders.query_nearest(

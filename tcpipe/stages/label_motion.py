@@ -180,7 +180,7 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> Mask:
 
 
 def _find_gap_edges(rows: pa.Table, rate_hz: float) -> Mask:
-    """Return the rows that are in a gap, or beside a hole."""
+    """Return the rows that are in a gap of a sensor, or next to a gap of the track."""
     piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
     hole = np.diff(piece) != 0
     edge: Mask = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.GAP)) != 0
@@ -259,7 +259,7 @@ def _make_budget(energy_joule: Floats, variance_j2: Sequence[Mapping[str, Floats
 
 
 def find_label_findings(facts: LabelFacts, rails: Iterable[Rail]) -> Findings:
-    """Return what was observed while labelling by all rails of a run."""
+    """Return the findings of labelling, from all rails of a run."""
     findings = []
     if facts.quality["low_power_rate"] and facts.segments_without_power < facts.segments:
         findings.append(_find_low_rate(facts, rails))

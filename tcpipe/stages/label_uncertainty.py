@@ -1,4 +1,4 @@
-"""Errors common to all segments of a run (gain and zero of power, scale of a lone odometry), and their findings."""
+"""Errors common to all segments of a run (gain and zero of power, scale of a single odometry), and their findings."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -129,7 +129,7 @@ _POWER = Subject("role", "power")
 
 
 def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> Iterator[Finding]:
-    """Yield what the audit of the power sensor found; ``start_ns`` is when the track begins."""
+    """Yield the findings of the audit of the power sensor; ``start_ns`` is the start of the track."""
     facts, power = label.power_sensor, info.report.facts.power
     if facts is None:
         return
@@ -182,7 +182,7 @@ _NEGATIVE = "idle-power-negative"
 def find_negative_idle(
     idle: IdlePower, driving_watt: float | None, power: PowerSign | None, rails: Sequence[Rail]
 ) -> Iterator[Finding]:
-    """Yield a finding, with remedy, if power is clearly negative in every halt and the battery is not being charged."""
+    """Yield a finding, with remedy, if power is clearly negative in every stop and the battery is not being charged."""
     if power is None or power.charging or driving_watt is None:
         return
     least_watt = read_threshold(_NEGATIVE, "min_driving_fraction") * driving_watt
@@ -249,7 +249,7 @@ def make_sensor_error(cut: pa.Table, rails: list[Rail], facts: PowerSensorFacts,
     ]
     rise = (to_floats(cut, "end_z_m") - to_floats(cut, "start_z_m")) / to_floats(cut, "chord_m")
     lost = find_lost_signs(measure_sag(rails), *spans, rise)
-    # What flows back counts as drawn: the energy is wrong by twice itself.
+    # Returned energy counts as drawn: the error is twice this energy.
     sign_joule = np.where(lost, np.abs(integrate_energy(rails, *spans, rule=rule)), 0.0)
     offset_joule = np.linalg.norm(offsets, axis=0) if offsets else np.nan
     return SensorError(facts.gain_std_fraction, offset_joule, sign_joule)

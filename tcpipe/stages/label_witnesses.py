@@ -39,12 +39,12 @@ class _Comparison:
 
     @property
     def excess(self) -> float:
-        """By how much the ratio is outside of the range, as a logarithm."""
+        """Distance of the ratio from the range, as a logarithm."""
         return float(max(np.log(abs(self.ratio) / self.high), np.log(self.low / max(abs(self.ratio), 1e-9))))
 
 
 def find_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> Iterator[Finding]:
-    """Yield what confirms each label of labelled segments, and what contradicts the power; nothing without segments."""
+    """Yield the witnesses of each label, and contradictions of the power; nothing without segments."""
     if not table.num_rows:
         return
     sensors = _list_confirming_sensors(table, facts)
@@ -78,7 +78,7 @@ def _list_confirming_sensors(table: pa.Table, facts: StageFacts) -> list[str]:
 
 
 def _find_energy_witnesses(table: pa.Table, facts: StageFacts, robot: Robot) -> Iterator[Finding]:
-    """Yield what confirms or contradicts the energy."""
+    """Yield the witnesses that confirm or contradict the energy."""
     comparisons, missing = _compare_power(table, facts, robot)
     contradicting = [each for each in comparisons if not each.is_possible]
     if contradicting:

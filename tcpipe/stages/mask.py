@@ -127,7 +127,7 @@ def _find_motion_reasons(rows: MotionRows, config: MaskConfig) -> dict[DropReaso
 
 
 def _find_accelerating(rows: MotionRows, halted: Mask, config: MaskConfig) -> Mask:
-    """Mark commanded changes, ramps beside halts, and lasting accelerations without a command or just before it ends.
+    """Mark commanded changes, ramps next to stops, and lasting accelerations without a command or just before it ends.
 
     Before the commands end, a change may be missing: the last command is extended.
     """
@@ -291,7 +291,7 @@ def _compute_common_std_mps(track: Track) -> Floats:
 
 
 def _subtract_variance(std: Floats, part: Floats) -> Floats:
-    """Return a deviation less a part of it; NaN where it is not known."""
+    """Return a σ without the variance of a part of it; NaN if it is unknown."""
     return np.sqrt(np.maximum(std**2 - part**2, 0.0))
 
 

@@ -36,7 +36,7 @@ class LogReader(Protocol):
         """
 
     def batches(self, topics: Sequence[str]) -> Iterator[Tables]:
-        """Yield these tables piecewise: the next rows of some topics; a message far behind its time comes later."""
+        """Yield these tables in parts: the next rows of some topics; a message far behind its time comes later."""
 
 
 def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> Arrays:
@@ -164,7 +164,7 @@ def gather_messages(
 
 
 def _compact_column(values: AnyArray) -> AnyArray:
-    """Return a copy of its own of a column's values; one row for all, where every row has the same bits."""
+    """Return a copy of a column's values; a single row if all rows have the same bits."""
     values = np.ascontiguousarray(values)
     row_bytes = values[:1].nbytes
     if len(values) < 2 or not row_bytes:

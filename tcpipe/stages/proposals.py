@@ -1,7 +1,7 @@
 """Proposals for a recipe: fixes, inertial measurements and power in unknown messages, by names and values.
 
 `tcpipe inspect`, `preflight`, `ingest` and `init --from` use them. Values that contradict the names exclude a proposal;
-``doubt`` states what remains to be checked.
+``doubt`` states the points that the user must check.
 """
 
 import re
@@ -37,7 +37,7 @@ def find_proposals(log: LogReader, assignment: RoleAssignment, config: ReadConfi
     known_types = {*known.types(), *(type_name for types in ROLE_TYPES.values() for type_name in types)}
     of_role = {
         (role, topic): fields
-        for role in ("gnss", "imu")  # whose fields are called so that nothing else is taken for them
+        for role in ("gnss", "imu")  # their field names are unambiguous
         if role not in settled and not types & set(ROLE_TYPES[role])
         for topic in free
         if (fields := match_field_names(role, [field for field in list_number_fields(topic) if "[]" not in field]))
@@ -187,7 +187,7 @@ def _judge_source(columns: Columns, topic: str, keys: Keys, numbers: dict[str, f
 
 
 def _find_bare_quantity(topic: str) -> str:
-    """Return what a bare number is by its topic's name: a voltage, a current, a power; "" where it does not say."""
+    """Return the quantity of a plain number by its topic's name: voltage, current or power; "" if unknown."""
     is_watt = bool({"power", "watt", "watts"} & set(split_words(topic.rpartition("/")[2])))
     return find_quantity(topic) or ("power" if is_watt else "")
 
@@ -256,7 +256,7 @@ _DRIVING = re.compile(r".*(wheel|drive|motor|track|axle)(?!.*steer).*")
 
 
 def _find_joints(topics: Sequence[Topic], columns: Mapping[str, Columns]) -> Iterator[_Candidate]:
-    """Yield the joint states that have efforts and velocities of what drives."""
+    """Yield the joint states that have efforts and velocities of the drives."""
     for topic in topics:
         own = columns[topic.name] if topic.type_name == JOINT_STATE else {}
         names = [str(name) for name in np.unique(own.get("name[]", np.zeros(0, "U1"))).tolist()]

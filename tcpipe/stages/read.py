@@ -1,4 +1,4 @@
-"""Read: a log becomes one table a role, in SI units, on one clock, with every sensor's place (L0 to L1)."""
+"""Read a log into one table per role, in SI units, on one clock, with the extrinsics of every sensor (L0 to L1)."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -34,7 +34,7 @@ from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 
 def find_read_config(recipe: Recipe, topics: Collection[str]) -> ReadConfig:
-    """Return the configuration for a log of these topics: mapped tables that it holds are used as their roles."""
+    """Return the configuration for a log of these topics: its mapped tables are used as their roles."""
     roles: dict[Role, list[str]] = {}
     for name, table in recipe.tables.items():
         role = cast("Role", table.role or name)
@@ -84,24 +84,24 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
 
     `RoleError`: a role cannot be decided, or no topic measures motion; `RecipeError`: no profile has the robot's name.
     """
-    # 1. Which topic is used as which role, from the topic list alone.
+    # 1. Decide which topic is used as which role, from the topic list alone.
     assignment = decide_roles(config, log.topics.values(), robot, known=known)
     if assignment.problems:
         proposals = find_proposals(log, assignment, config, known)
         raise RoleError(*assignment.problems, findings=(*assignment.findings, *proposals))
-    # 2. Messages to SI columns; what cannot be used is counted.
+    # 2. Convert messages to SI columns, and count unusable ones.
     played = dict.fromkeys(topic for role in assignment.roles.values() for topic in role.topics)
     played |= dict.fromkeys(list_second_meters(assignment, log.topics, config, known))
     lists = {topic: list_power_lists(log.topics[topic].type_name, known.power_sources) for topic in played}
     messages, tables = gather_messages(log.batches([*played, *assignment.static_transforms]), lists)
     every, power, unread = read_sources(messages, log.topics, assignment, config, known=known)
-    # 3. Every stamp on one clock, every epoch common to all.
+    # 3. Bring all stamps to one clock with common epochs.
     clocks = settle_clocks(
         {source.key: _read_times(source, config) for source in every if len(source.readings.row)},
         clock_published=any(topic.type_name == CLOCK and topic.message_count for topic in log.topics.values()),
     )
     timelines = clocks.timelines
-    # 4. One checked table a role, and where its sensor sits.
+    # 4. Make one checked table per role, with the extrinsics of its sensor.
     sources = [source for source in every if source.key in timelines]
     streams: dict[str, pa.Table] = {
         role: make_role_table(role, sources, timelines, power)

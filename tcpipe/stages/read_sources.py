@@ -53,7 +53,7 @@ class TopicReadings:
 
     @property
     def key(self) -> str:
-        """Its identity: one topic may hold positions and velocities."""
+        """Identity of the source: one topic may contain positions and velocities."""
         return f"{self.topic} ({self.role})" if self.role == "gnss_velocity" else self.topic
 
 
@@ -168,7 +168,7 @@ def convert_imu_to_si(readings: Readings, units: str) -> Readings:
 
 
 _LENGTHS = {"velocity_": 1, "velocity_var_": 2, "x_m": 1, "y_m": 1, "z_m": 1}
-"""Columns of an odometry, or how they begin, that hold lengths, and to which power."""
+"""Columns of an odometry (or their prefixes) that contain lengths, with the exponent of the length."""
 
 
 def scale_odometry(readings: Readings, factor: float) -> Readings:
@@ -192,7 +192,7 @@ def _read_fields(columns: Arrays, role: Role, config: ReadConfig) -> Arrays:
 
 
 _WITHOUT_PLACE = ("power", "command", "gnss_velocity")
-"""A receiver's velocity is that of its antenna, which the fixes place."""
+"""Roles without extrinsics of their own; a receiver's velocity has those of its fixes."""
 
 
 def place_sensors(
@@ -204,7 +204,7 @@ def place_sensors(
     *,
     config: ReadConfig,
 ) -> tuple[dict[str, Sensor], list[Finding]]:
-    """Return each role's sensor, and findings: frames that nothing places, topics with several frames."""
+    """Return each role's sensor, and findings: frames without extrinsics, topics with several frames."""
     of_role = {role: [source for source in sources if source.role == role] for role in get_args(Role)}
     frame_of = {role: next(iter(found[0].frames), "") for role, found in of_role.items() if found}
     sensors: dict[str, Sensor] = {}

@@ -1,4 +1,4 @@
-"""LabelledSegments to patches: what the ground of each segment looks like on its map, and why some have no patch."""
+"""LabelledSegments to patches: cut-outs of the map under each segment, and reasons for missing patches."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ from tcpipe.terrain.sampling import (
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, find_map_projection
 
 Shifts = Mapping[str, tuple[float, float, float]]
-"""By run: what is added to its positions to find their ground on a map, x and y, and the DRMS of that [m]."""
+"""By run: shift of its positions on a map, x and y, and its DRMS [m]."""
 
 _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
 
@@ -179,7 +179,7 @@ def _find_losses(patches: Patches, corners: Floats, source: MapReader, config: S
 
 
 def sum_losses(arc_length_m: Floats, lost_by: NDArray[np.uint32]) -> dict[Loss, float]:
-    """Return metres driven by what they are lost to."""
+    """Return lost metres by reason."""
     return {loss: float(arc_length_m[lost_by == loss].sum()) for loss in _LOSSES}
 
 
@@ -224,7 +224,7 @@ def sample_on_maps(
     for number, (source, pool, moved) in enumerate(each):
         here = segments if len(waiting) == segments.num_rows else segments.take(waiting)
         found = sample_segments(here, source, config, gnss_crs=gnss_crs, pool=pool, shifts=moved)
-        known = found.lost_by != Loss.OUTSIDE_MAP  # a hole in one map outweighs lying outside the next
+        known = found.lost_by != Loss.OUTSIDE_MAP  # missing data in one map has priority over being outside the next
         lost_by[waiting[known]] = found.lost_by[known]
         place = np.full(found.kept.size, number, np.uint8)
         placed = _project_to_first_map(found, source, sources[0])

@@ -27,11 +27,11 @@ from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshol
 from tcpipe.tables.levels import SEGMENTS, MaskedTrack, Segments, TrackInfo, add_findings
 
 ENTRIES = ("kept", *(flag_name(bit) for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))
-"""Names of the ledger's entries, in order."""
+"""Names of the entries of the distance breakdown, in order."""
 
 
 def segment_track(masked: MaskedTrack, config: SegmentConfig) -> Segments:
-    """Return the segments of the track's steady sections, and the ledger of all its metres: its sum is the odometer."""
+    """Return the segments of the track's steady sections, and the distance breakdown, whose sum is the odometer."""
     table, info = masked.table, masked.info
     stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch")
     position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
@@ -56,7 +56,7 @@ def segment_track(masked: MaskedTrack, config: SegmentConfig) -> Segments:
             tables.append(_make_segments(table.slice(first, last + 1 - first), path, cut, info))
     segments = pa.concat_tables(tables).combine_chunks()
     facts = SegmentFacts(segments.num_rows, len(spans), odometer_m=sum(metres.values()), duration_by_reason_s=seconds)
-    findings = [] if segments.num_rows else [_find_why_none(metres, info.run_id)]
+    findings = [] if segments.num_rows else [_make_no_segments(metres, info.run_id)]
     findings += find_losses(metres, Subject("run", info.run_id))
     return Segments(segments, add_findings(info, findings, replace(info.report.facts, segment=facts)), metres)
 
@@ -89,12 +89,12 @@ def _make_segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) ->
         columns[f"{name}_velocity_mps"] = mean_between(path.stamp_ns, signal, cut.start_ns, cut.end_ns)
     std_m = np.hypot(
         to_floats(rows, "x_std_m"), to_floats(rows, "y_std_m")
-    )  # DRMS: holds whatever way the error points
+    )  # DRMS: independent of the direction of the error
     ends_m = [interpolate(path.stamp_ns, std_m, at_ns) for at_ns in (cut.start_ns, cut.end_ns)]
     return SEGMENTS.table(**columns, position_std_m=np.maximum(*ends_m))
 
 
-def _find_why_none(metres: dict[str, float], run_id: str) -> Finding:
+def _make_no_segments(metres: dict[str, float], run_id: str) -> Finding:
     """Return the finding that a run has no segment, with the largest loss."""
     driven_m, reason = sum(metres.values()), max(metres, key=lambda entry: metres[entry])
     if driven_m < read_threshold("no-segments", "min_driven_m"):

@@ -64,7 +64,7 @@ def make_text_column(values: Iterable[str]) -> pa.Array:
 
 
 def select_rows(table: pa.Table, name: str, value: str | int) -> pa.Table:
-    """Return the rows whose column ``name`` holds ``value``; the table itself where all do."""
+    """Return the rows whose column ``name`` has the value ``value``; the table itself if all have it."""
     column = table.column(name)
     chosen = (to_texts(column) if isinstance(value, str) else to_numbers(column)) == value
     return table if chosen.all() else table.filter(number_column(chosen))

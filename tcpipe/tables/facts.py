@@ -45,10 +45,9 @@ class ClockStep:
 class PowerSign:
     """Sign of a drawn current and its source; whether the power source averages over its message period.
 
-    ``includes``: known loads besides the drives (computers, payload). ``gain_std_fraction``, ``offset_std_amp``: σ of
-    gain and zero of a sensor of this kind. ``rest_current_amp``: possible currents of a rail of it at rest, None if
-    unknown.
-    ``zero_amp``: zero of each current that the recipe states [A]. ``charging``: something charges the battery.
+    ``includes``: known loads other than the drives (computers, payload). ``gain_std_fraction``, ``offset_std_amp``: σ
+    of gain and zero of a sensor of this kind. ``rest_current_amp``: possible currents of a rail of it at rest, None if
+    unknown. ``zero_amp``: zero of each current that the recipe states [A]. ``charging``: something charges the battery.
     """
 
     current_sign: str
@@ -282,7 +281,7 @@ class HeldOut:
     samples: int
     """Samples in it."""
     overlapping_samples: int
-    """Those whose footprint shares ground with a train footprint."""
+    """Number of samples whose footprint shares ground with a train footprint."""
     overlapping_pairs: int
     """Pairs of footprints, one held out and one in train, that share ground."""
     same_track_pairs: int
@@ -346,7 +345,7 @@ class PhysicsFacts:
 
 @dataclass(frozen=True, slots=True)
 class Smoothing:
-    """Power values are means from ``before_s`` before the stamp to ``after_s`` after it, besides the source's own."""
+    """Power values are means from ``before_s`` before the stamp to ``after_s`` after it, without the source's averaging."""
 
     before_s: float
     after_s: float
@@ -366,7 +365,7 @@ class Smoothing:
 class PowerSensorFacts:
     """Power sensor uncertainty: σ of its gain and of a rail's zero [A], and log observations (`tcpipe.power.audit`).
 
-    ``rest_amp``: lowest and highest current of a rail in halts; ``battery_ohm``: resistance of the battery by its sag
+    ``rest_amp``: lowest and highest current of a rail in stops; ``battery_ohm``: resistance of the battery by its sag
     [ohm]; the gain changed by ``gain_ratio`` at ``gain_changed_ns``; ``lost_signs``: segments whose current flows back
     without a sign; ``smoothing``: None if power is not smoothed; ``delay_s``: of power behind the motion, with its σ;
     None if unobservable.

@@ -19,7 +19,7 @@ from typing import Any, Generic, Literal, TypeAlias, TypeVar
 Severity: TypeAlias = Literal["error", "warning", "note"]
 Affected: TypeAlias = Literal["position", "time", "energy"]
 WITNESSES_OF_LABEL = "label-witnesses"
-"""Code of the findings that state what confirms a label; their subject is the label."""
+"""Code of the findings on witnesses; their subject is the label."""
 Witness: TypeAlias = Literal["wheel_odometry", "visual_odometry", "slope", "charge", "second_meter", "nothing"]
 """Measurement that can confirm a label: other odometry than GNSS (position, time); power needed by slopes, fall of the
 battery's charge, or a second meter (energy)."""
@@ -38,7 +38,7 @@ class Entry:
 
     Attributes
     ----------
-    title : what a reader searches for.
+    title : words that a reader searches for.
     template : one line; ``{subject}``, ``{span}``, numbers (written with the unit of their suffix) and names of the
         finding.
     severity : error: the affected labels are not usable; warning: usable with care; note: no change of the verdict.
@@ -98,7 +98,7 @@ def read_catalogue_version() -> str:
 
 
 def find_entry(code: str) -> Entry:
-    """Return the entry of a code; of one that another version made, what its name says."""
+    """Return the entry of a code; of an unknown code of another version, an entry from its name."""
     words = code.replace("-", " ")
     return read_catalogue().get(code) or Entry(words, f"{{subject}}: {words}", "")
 

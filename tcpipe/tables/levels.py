@@ -538,7 +538,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class _Level:
-    """The table of a level, checked against its schema, and what belongs to the whole track."""
+    """The table of a level, checked against its schema, and facts of the whole track."""
 
     schema: ClassVar[TableSchema]
     table: pa.Table

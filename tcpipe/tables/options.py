@@ -18,7 +18,7 @@ R = TypeVar("R")
 
 
 class Range(NamedTuple):
-    """The bounds of a number; msgspec, which knows bounds too, would make ``--help`` slower."""
+    """The bounds of a number; those of msgspec would make ``--help`` slower."""
 
     least: float
     most: float
@@ -132,7 +132,7 @@ def _check_bounds(options: Any, function: str) -> None:
 
 
 def _describe_mismatch(kind: Kind, value: Any) -> str:
-    """Return what an option is to be, "" where it is that."""
+    """Return the expected value of an option as text, "" if its value is valid."""
     if isinstance(kind, Range):
         is_inside = (
             _is_number(value) and kind.least <= value <= kind.most and not (kind.is_open and value == kind.least)

@@ -74,7 +74,7 @@ class ClassTable:
         return found
 
     def differences(self, other: ClassTable) -> tuple[str, ...]:
-        """Return how this table differs from another, one plain clause an id; nothing where they are the same."""
+        """Return how this table differs from another, one clause for each id; () if they are equal."""
         mine, theirs = ({entry.id: entry for entry in table.classes} for table in (self, other))
         clauses = []
         for class_id in sorted(mine | theirs):
@@ -90,7 +90,7 @@ def _describe_class(entry: TerrainClass | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ClassScheme:
-    """A class table together with the raster values that stand for its ids (several values may share an id)."""
+    """A class table together with the raster values of its ids (several values may share an id)."""
 
     table: ClassTable
     id_by_value: Mapping[int, int]
@@ -105,7 +105,7 @@ class ClassScheme:
 
 
 def name_key(name: str) -> str:
-    """Return what two spellings of a class name have in common: case, '_' and '-' do not matter."""
+    """Return a class name in a common spelling: case, '_' and '-' do not matter."""
     return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 
@@ -148,14 +148,14 @@ PAPER_CLASSES = ClassTable(
 """The paper's seven classes."""
 
 PAPER_SCHEME = ClassScheme(PAPER_CLASSES, {entry.id: entry.id for entry in PAPER_CLASSES.classes})
-"""The default: a raster that holds the paper's ids themselves."""
+"""The default: a raster with the paper's ids as values."""
 
 
 Pixels: TypeAlias = NDArray[np.uint8 | np.uint16 | np.float16 | np.float32 | np.float64]
 """Pixels of a layer: bytes or floats in a map, steps above the lowest pixel in a patch."""
 
 LayerPixels: TypeAlias = NDArray[np.uint8 | np.uint16 | np.float16 | np.float32]
-"""Patches of one layer as they are stored, shape (N, px, px)."""
+"""Stored patches of one layer, shape (N, px, px)."""
 Kind = Literal["continuous", "categorical", "relative"]
 Stack = Literal["relative", "floats", "greys", "classes"]
 
@@ -187,7 +187,7 @@ LUMA_RGB = (0.299, 0.587, 0.114)
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _TAKEN = (*LAYERS, *COLOURS, *("classes", "row", "column", "sample", "spatial_ref", "x", "y", "overviews"))
-"""Names that layers must not have, besides those of columns of samples."""
+"""Names that layers must not have, in addition to those of columns of samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,12 +226,12 @@ class Layer:
 
     @property
     def nodata(self) -> float:
-        """Return what a pixel of a patch without data holds: 0, NaN, or the largest number of a relative layer."""
+        """Return the value of a patch pixel without data: 0, NaN, or the largest number of a relative layer."""
         return HEIGHT_NODATA if self.kind == "relative" else find_no_data_value(self.stored)
 
     @property
     def stack(self) -> Stack:
-        """Return what it is sampled together with."""
+        """Return the stack of layers with which it is sampled."""
         if self.kind == "continuous":
             return "greys" if self.mapped == np.uint8 else "floats"
         return "relative" if self.kind == "relative" else "classes"
@@ -242,14 +242,14 @@ class Layer:
 
     @property
     def channel_of_bytes(self) -> Floats32:
-        """Return what each byte of a layer of bytes becomes in the tensor, in [0, 1], shape (256,)."""
+        """Return the tensor value of each byte of a layer of bytes, in [0, 1], shape (256,)."""
         one = np.float32
         above = np.maximum(np.arange(256, dtype=one) - one(self.low / self.step), one(0.0))
         return np.asarray(np.minimum(above / one(max((self.high - self.low) / self.step, 1.0)), one(1.0)))
 
     @property
     def scaling(self) -> tuple[float, float]:
-        """Return what a stored number is multiplied by, and what is added, so that low and high become 0 and 1."""
+        """Return the factor and offset that convert stored numbers so that low and high become 0 and 1."""
         width = (self.high - self.low) or 1.0
         return self.step / width, -self.low / width
 
@@ -259,7 +259,7 @@ Layers: TypeAlias = Mapping[str, Layer]
 
 
 def find_no_data_value(dtype: np.dtype[np.generic]) -> float:
-    """Return what stands for no data in a map's pixels of a type."""
+    """Return the value of no data in a map's pixels of a type."""
     return float("nan") if dtype.kind == "f" else 0
 
 
@@ -294,7 +294,7 @@ def make_continuous_layer(name: str, *, unit: str, low: float, high: float) -> L
 
 
 def make_categorical_layer(name: str, classes: ClassTable) -> Layer:
-    """Return a categorical layer with classes of its own."""
+    """Return a categorical layer with its own classes."""
     long_name = f"{name.replace('_', ' ')} class id"
     return Layer(name, "categorical", long_name, _BYTE, _BYTE, low=1.0, high=float(classes.count), classes=classes)
 
@@ -320,12 +320,12 @@ def join_layers(maps: Sequence[Layers]) -> dict[str, Layer]:
 
 
 def group_stacks(layers: Layers) -> dict[Stack, list[str]]:
-    """Return the names of layers by what they are sampled together with."""
+    """Return the names of layers by their stack."""
     return {stack: [name for name, layer in layers.items() if layer.stack == stack] for stack in STACKS}
 
 
 def find_wrong_name(name: str, *, taken: Collection[str]) -> str | None:
-    """Say why a user's layer cannot have a name, among those that are taken already; None where it can."""
+    """Return the reason why a user's layer cannot have a name, given the used names; None if it can."""
     if name in _TAKEN or name in taken or name.endswith("_one_hot"):
         return f"layer {name}: the name is taken; choose another"
     if not _NAME.fullmatch(name):

@@ -23,7 +23,7 @@ from tcpipe.errors import MapError
 from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 
 MAX_SCALE_ERROR = 0.01
-"""A CRS whose unit is further from a metre of ground than this share is not metric enough to cut patches in."""
+"""A CRS whose unit is further from a metre of ground than this share is not metric enough for patches."""
 
 _EARTH_RADIUS_M = 6_371_000.0
 
@@ -133,7 +133,7 @@ def find_utm_crs(crs: CRS, xy: tuple[float, float]) -> CRS:
 
 @dataclass(frozen=True)
 class Projection:
-    """Operation from one CRS to another over one area: one for all its points, so that neighbours transform alike.
+    """Operation from one CRS to another over one area: one for all points, so that neighbours agree.
 
     ``area_deg`` is west, south, east, north. Axes are always x (longitude, east) first.
     """

@@ -49,7 +49,7 @@ _BLOCKS, _DRAWS, _FEW_BLOCKS = 12, 200, 1.38
 _SIGMAS, _OUTLIER, _EDGE_M = 5.0, 3.5, 0.75 * _STEP_M
 """Least decrease of the misfit by a shift [σ]; least outlier [σ]; least step beyond the best inner shift [m]."""
 _CHI2_999 = 13.82  # 99.9 % of χ² with two degrees of freedom
-_LEAST_GAIN = -2.0 * np.log(0.9)  # A shift that leaves more than 90 % of the misfit is not what was wrong
+_LEAST_GAIN = -2.0 * np.log(0.9)  # A shift that leaves more than 90 % of the misfit is not the cause
 _RIDGE = 1e-12  # smallest divisor
 _UNITS = {0.3048: "ft", 0.1: "dm", 0.01: "cm", 0.001: "mm"}
 _UNITS |= {1.0 / metres: "m" for metres in _UNITS}
@@ -85,7 +85,7 @@ class HeightScale:
         return next((unit for scale, unit in _UNITS.items() if abs(self.value / scale - 1.0) < error), "")
 
     def is_off(self) -> bool:
-        """Return whether map and track surely do not rise alike."""
+        """Return whether map and track certainly have different height scales."""
         least = read_threshold("map-height-scale", "min_error_fraction")
         return self.is_known and abs(self.value - 1.0) > max(_SIGMAS * self.std, least)
 
@@ -138,7 +138,7 @@ class Registration:
 def register_track(source: MapReader, xy_m: Floats, height_m: Floats) -> Registration | None:
     """Return the horizontal shift at which the map's ground fits the heights of a track best.
 
-    None where fewer than 60 points, half a metre apart, lie well inside the map and on its ground.
+    None where fewer than 60 points, half a metre apart, are well inside the map and on its ground.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def _flatten(excess_m: Floats, xy_m: Floats) -> tuple[Floats, Floats, Ints]:
     place = np.minimum(path_m * count // path_m[-1], count - 1)
     _, first, stretch, sizes = np.unique(place, return_index=True, return_inverse=True, return_counts=True)
     flat_m, tilt = (each - (np.add.reduceat(each, first).T / sizes).T[stretch] for each in (excess_m, xy_m))
-    # Blocks of stretches near each other: errors of the map are alike wherever the track passes again.
+    # Blocks of sections near each other: errors of the map repeat where the track passes again.
     east_m, north_m = ((xy_m - tilt)[first] - xy_m.min(axis=0)).T
     rank = np.argsort(np.argsort(compute_morton(east_m.astype(np.int64), north_m.astype(np.int64)), kind="stable"))
     return _remove_tilt(flat_m, tilt), tilt, (rank * min(_BLOCKS, len(sizes)) // len(sizes))[stretch]

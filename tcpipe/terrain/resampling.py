@@ -145,11 +145,11 @@ def choose_factor(factors: Sequence[int], map_pitch_m: float, pixel_size_m: floa
 
 
 def iterate_levels(layer: Layer, values: Pixels, factors: Sequence[int]) -> Iterator[tuple[int, Pixels]]:
-    """Yield each factor above 1 and the layer at it.
+    """Yield each factor above 1 with the layer reduced by it.
 
     Parameters
     ----------
-    layer : what it is.
+    layer : the layer, whose kind determines the reduction.
     values : pixels of the map, shape (R, C): floats with NaN, or bytes with 0, as no data.
     factors : powers of two, rising, as `list_factors` gives them.
     """
@@ -167,7 +167,7 @@ def iterate_levels(layer: Layer, values: Pixels, factors: Sequence[int]) -> Iter
 
 
 def _halve(values: Pixels) -> Pixels:
-    """Return means of 2 x 2 pixels; an odd last row or column is left out."""
+    """Return means of 2 x 2 pixels; a single last row or column is left out."""
     even = values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2]
     rows = even[0::2] + even[1::2]
     return np.asarray((rows[:, 0::2] + rows[:, 1::2]) * rows.dtype.type(0.25))

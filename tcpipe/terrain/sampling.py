@@ -36,7 +36,7 @@ def compute_relief_m(height: NDArray[np.uint16]) -> Floats:
     return np.asarray(steps * HEIGHT_STEP_M)
 
 
-_MOVED_ROWS = 128  # patches moved at once: they stay in the processor's cache on the way
+_MOVED_ROWS = 128  # patches moved together: they fit into the processor's cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ def sample_patches(
     Parameters
     ----------
     source : the map.
-    frames : where the patches lie, in the map's CRS.
+    frames : frames of the patches, in the map's CRS.
     chord_m : length of each segment on the ground [m], shape (N,).
     patch_m, patch_px : side of a patch on the ground [m], and in pixels.
     pool : tiles of the level that `choose_level` returns for the patches' pixel size, kept between calls; None keeps
@@ -157,7 +157,7 @@ def find_classes_at(source: MapReader, xy_m: Floats) -> NDArray[np.int16]:
     Parameters
     ----------
     source : a map with a terrain layer.
-    xy_m : points in the map's CRS [m], shape (N, 2); what is not finite is off the map.
+    xy_m : points in the map's CRS [m], shape (N, 2); points that are not finite are off the map.
     """
     found = np.full(len(xy_m), OFF_THE_MAP, np.int16)
     on = np.flatnonzero(source.grid.contains(xy_m))
@@ -212,7 +212,7 @@ def compute_footprints(frames: PatchFrames, patch_m: float) -> Floats:
 
 
 def count_corners_on(grid: MapGrid, footprint_xy_m: Floats) -> Ints:
-    """Return how many corners of each footprint, shape (N, 4, 2), lie on the map, shape (N,)."""
+    """Return the number of corners of each footprint, shape (N, 4, 2), on the map, shape (N,)."""
     return np.asarray(np.count_nonzero(grid.contains(footprint_xy_m), axis=1))
 
 
@@ -243,7 +243,7 @@ def map_px_from_patch(frames: PatchFrames, grid: MapGrid, *, patch_m: float, pat
 def sample_chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: Floats, points: int) -> Floats:
     """Return evenly spread points on each chord: x and y of the first, dx and dy to the next, shape (N, 4) [map px].
 
-    Point k lies at (k + ½) / points of the chord.
+    Point k is at (k + ½) / points of the chord.
     """
     step_m = chord_m[:, None] / points
     first = frames.centre_xy_m + frames.along_xy * (step_m - chord_m[:, None]) / 2.0

@@ -34,7 +34,7 @@ class Tiles(NamedTuple):
 
 
 class Ground(NamedTuple):
-    """Where N patches lie on the map.
+    """Frames of N patches on the map.
 
     ``boxes``: first row and column, last row and column (exclusive) of the map pixels that a patch and its chord touch,
     with taps and a margin of one pixel, (N, 4). ``frames`` and ``chords``: affine map pixel positions

@@ -155,7 +155,7 @@ def _cover(crs: str, bounds_m: Box, base_m: tuple[float, float], pitch: float) -
 
 
 def _refuse_huge(height: Georeference, sides_m: tuple[float, float], pixel_size_m: float) -> None:
-    """Refuse a grid that no disk and no night would hold."""
+    """Reject a grid that is too large for a disk or for one night of computing."""
     cols, rows = (side_m / pixel_size_m if pixel_size_m > 0.0 else math.inf for side_m in sides_m)
     if not (max(cols, rows) <= MAX_SIDE_PX and cols * rows <= MAX_PIXELS):
         raise MapError(

@@ -152,7 +152,7 @@ class TilePool:
             self.slots[tile] = slot
 
     def _grow(self, tiles: int) -> None:
-        """Make room for so many tiles."""
+        """Make room for a number of tiles."""
         size = tiles * self._map.tile_px**2
         for stack, old in self._flat.items():
             if old.shape[1] < size:

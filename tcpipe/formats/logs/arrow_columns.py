@@ -240,7 +240,7 @@ def make_lists(values: pa.Array, counts: _Int64, length: int | None) -> pa.Array
 
 
 class WalkedColumns:
-    """Builds the columns of messages that `tcpipe.logs.wire_types` has walked; ``data`` is what it walked over."""
+    """Builder of the columns of messages that `tcpipe.logs.wire_types` has parsed; ``data`` are their bytes."""
 
     def __init__(self, data: Bytes) -> None:
         self.replaced_texts = 0

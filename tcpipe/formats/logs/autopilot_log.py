@@ -41,7 +41,7 @@ _HEAD = b"\xa3\x95"
 _FORMAT, _FORMAT_BYTES = 0x80, 89
 _STRAY_US, _LATE_US = 1_000_000, 3_600 * 10**6
 _WINDOW = 5
-"""Messages in a row by whose median a stray stamp is found."""
+"""Number of successive messages whose median reveals a wrong stamp."""
 _MOST_DIGITS, _DEEPEST = 5, 5
 """Most digits of a list's length, and most levels of nested formats [1]; a format with more is damaged."""
 
@@ -52,7 +52,7 @@ Layout = np.dtype[np.void]
 class AutopilotMessages:
     """Messages of one name and instance, by time since boot [µs], with the offsets in the file of their fields.
 
-    ``scales`` are by field: what one of a whole number is in the field's unit.
+    ``scales`` are by field: the size of one integer step in the field's unit.
     """
 
     name: str
@@ -99,7 +99,7 @@ class AutopilotRecords:
     def add_damage(
         self, cause: str, topic: str | None = None, lost: int | None = None, *, reason: str = "", places: int = 1
     ) -> None:
-        """Add damage; more than some thousand entries say nothing new."""
+        """Add damage, up to a limit of some thousand entries."""
         self._note(Damage(cause, self.path.name, topic=topic, messages_lost=lost, reason=reason, places=places))
 
     def skip_to(self, start: int, end: int) -> int:
@@ -179,7 +179,7 @@ _ULOG_TYPES = {
 }
 _ULOG_KINDS = frozenset(b"FDIMPQARSOLCB")
 _ULOG_HEAD = struct.Struct("<HBH")
-"""Size and kind of a message, and what number a message of data begins with."""
+"""Size and kind of a message, and the number at the start of a data message."""
 _MOST_BYTES = (1 << 16) - 3
 _DATA = ord("D")
 
@@ -204,7 +204,7 @@ class _UlogTopic:
     offsets: list[int] = field(default_factory=list)
 
     def fits(self, size: int) -> bool:
-        """Return whether a message of so many bytes, behind its head, can be one of it."""
+        """Return whether a message with this number of bytes after its header can have this format."""
         return self.layout.itemsize <= size - 2 <= self.most_bytes
 
 
@@ -258,7 +258,7 @@ class _UlogReader:
         return len(self._data)
 
     def _read_message(self, kind: int, at: int, size: int) -> None:
-        """Read a message that holds no data of a known topic."""
+        """Read a message that contains no data of a known topic."""
         text = self._data[at : at + size]
         match chr(kind):
             case "D":
@@ -337,7 +337,7 @@ _DATAFLASH_TYPES: dict[str, tuple[DTypeLike, float | None]] = {
     "c": ("<i2", 0.01), "C": ("<u2", 0.01), "e": ("<i4", 0.01), "E": ("<u4", 0.01), "L": ("<i4", 1e-7),
     "n": ("S4", None), "N": ("S16", None), "Z": ("S64", None), "a": (("<i2", (32,)), None),
 }  # fmt: skip
-"""By letter of a format: how a field lies, and what one of it is in its unit."""
+"""By letter of a format: type of a field, and the size of one step in its unit."""
 _INSTANCES = ("I", "Inst", "Instance")
 _WITHOUT_TIME = ("FMT", "FILE")
 
@@ -437,7 +437,7 @@ def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> Tab
         name: (message.time_us, select_fields(message.read_columns(records.data))) for name, message in known.items()
     }
     log = Autopilot(kind, messages, records.parameters)
-    with np.errstate(all="ignore"):  # what is not finite is counted where the values are used
+    with np.errstate(all="ignore"):  # users of the values count those that are not finite
         converted, findings = make_role_messages(log)
         offset_us, lever_arms = find_utc_offset_us(log), find_lever_arms(log.parameters)
     topics = [

@@ -1,8 +1,9 @@
 """ROS 1 bags, version 2.0 (http://wiki.ros.org/Bags/Format/2.0), read by their index or, without one, by records.
 
 A record is a header (fields ``name=value``) and data, each after its length (uint32). Chunks hold connections and
-messages; after a chunk stands an index record for each of its connections; the file ends with all connections and a
-summary of every chunk. A bag carries no checksum of its own: bz2 has one, lz4 and plain chunks have none.
+messages; after a chunk there is an index record for each of its connections; the file ends with all connections and a
+summary of every chunk. A bag contains no checksums: only chunks in bz2 have one, chunks in lz4 or without compression
+have none.
 """
 
 import struct
@@ -35,7 +36,7 @@ _TIME = struct.Struct("<II")
 
 @dataclass(frozen=True, slots=True)
 class BagRecord:
-    """A record: its header fields, and where its data lies."""
+    """A record: its header fields, and the position of its data."""
 
     fields: dict[bytes, bytes]
     data_offset: int
@@ -216,7 +217,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return {number: _make_topic(self._connections[number]) for number in sorted(self._connections)}
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, _Chunk]]:
-        """Return the chunks that may hold wanted connections, each with the most bytes in all chunks before it."""
+        """Return the chunks that may contain requested connections, each with an upper bound of the bytes before it."""
         found, sizes = [], []
         for first in range(0, len(self._chunks), _PLACED_AT_ONCE):
             chunks = self._chunks[first : first + _PLACED_AT_ONCE]
@@ -235,7 +236,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return found
 
     def _is_doubtful(self, chunk: _Chunk) -> bool:
-        """Return whether the index behind a chunk that should hold nothing wanted is another than the summary says."""
+        """Return whether the index of a chunk contradicts the summary, which lists no requested connection in it."""
         try:
             self._index_of(chunk)
         except DamageError:
@@ -252,7 +253,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return replace(chunk, record=record, size=size)
 
     def read_indexed(self, found: Excerpt) -> tuple[Messages, Mask]:
-        """Return the messages of an excerpt, and which of them the chunk holds as its index says.
+        """Return the messages of an excerpt, and which of them agree with the chunk's index.
 
         Headers of messages agree but for connection and time, so the first is parsed and the others compared to it.
         """
@@ -286,20 +287,20 @@ class BagPart(ChunkedPart[_Chunk]):
         return Messages(data, channel, offset, offset + (length + 8), payload_bytes, stamp_ns, stamp_ns), true
 
     def read_walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
-        """Return the wanted messages of a chunk by its records; what these lack is added to ``damage``."""
+        """Return the requested messages of a chunk from its records; missing ones are added to ``damage``."""
         found = self._step_through(chunk, data)
         return found.messages(data, wanted)
 
     def is_proved(self, chunk: _Chunk) -> bool:
-        """Tell whether the chunk has a checksum: bz2 brings one."""
+        """Return whether the chunk has a checksum: only bz2 has one."""
         return chunk.record is not None and chunk.record.codec == "bz2"
 
     def needs_index(self, chunk: _Chunk) -> bool:
-        """Tell whether a broken index is noted: there should be one."""
+        """Return whether a damaged index counts as damage: every chunk should have an index."""
         return chunk.counts is not None and not chunk.cut
 
     def _step_through(self, chunk: _Chunk, data: memoryview) -> ChunkRecords:
-        """Step through the records of a chunk, and note what is wrong with them."""
+        """Yield the records of a chunk, and record their damage."""
         walked = walk_chunk(data, self._bounds.most_records)
         self._bounds.walk(chunk.offset, walked.count)
         for connection in walked.connections if chunk.counts is None else ():
@@ -449,7 +450,7 @@ class BagPart(ChunkedPart[_Chunk]):
                 position = after
 
     def _take_record(self, position: int) -> int:
-        """Note what the record at ``position`` holds; return where the next begins."""
+        """Read the record at ``position``; return the position of the next one."""
         record = self._record(position)
         if record.opcode == OP_CHUNK:
             self._walk_chunk(position, record)

@@ -1,7 +1,7 @@
 """Read the chunks of a log of any format, by their index where the chunks agree with it, else record by record.
 
-In a log with cameras most bytes of a chunk are not wanted. What is wanted of several such chunks is laid together, and
-looked at once for all of them: what a look costs, however short, is paid once for thousands of messages instead of for
+In a log with cameras most bytes of a chunk are not requested. The requested bytes of several chunks are concatenated
+and parsed together: the fixed cost of a pass is paid once for thousands of messages instead of for
 each chunk.
 """
 
@@ -21,7 +21,7 @@ from tcpipe.formats.logs.log_part import Bounds, ByteSource, DamageError, Fetche
 from tcpipe.logs.topics import Topic
 
 GROUP_BYTES = 1 << 23
-"""Chunks of about this size together are planned at once."""
+"""Total size of chunks that are planned together [byte]."""
 _GAP_BYTES = 1 << 13
 """Messages no further apart are copied, or read from the disk, in one piece."""
 _PLACE_BITS = 40
@@ -100,7 +100,7 @@ class Messages:
 
 
 class PlacedChunk(Protocol):
-    """A chunk: the byte of the file where it begins, and how many bytes its records take, as far as it says."""
+    """A chunk: its offset in the file, and the size of its records, if stated [byte]."""
 
     @property
     def offset(self) -> int:
@@ -140,7 +140,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
 
     @abstractmethod
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, AnyChunk]]:
-        """Return the chunks that may hold wanted channels, each with the most bytes in all chunks before it."""
+        """Return the chunks that may contain requested channels, each with an upper bound of the bytes before it."""
 
     @abstractmethod
     def read_indexes(self, chunks: list[AnyChunk]) -> tuple[tuple[Ints, ...], Sequence[int]]:
@@ -152,7 +152,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
 
     @abstractmethod
     def load(self, chunk: AnyChunk) -> memoryview:
-        """Return all records of a chunk; of one cut by the file's end, what remains."""
+        """Return all records of a chunk; for a truncated chunk, the remaining ones."""
 
     @abstractmethod
     def find_plain_data(self, chunk: AnyChunk) -> int | None:
@@ -160,11 +160,11 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
 
     @abstractmethod
     def read_indexed(self, found: Excerpt) -> tuple[Messages, Mask]:
-        """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
+        """Return the messages of an excerpt, and which of them agree with the chunk's index."""
 
     @abstractmethod
     def read_walked(self, chunk: AnyChunk, data: memoryview, wanted: frozenset[int]) -> Messages:
-        """Return the wanted messages of a chunk by its records; what these lack is added to ``damage``."""
+        """Return the requested messages of a chunk from its records; missing ones are added to ``damage``."""
 
     @abstractmethod
     def is_proved(self, chunk: AnyChunk) -> bool:
@@ -193,7 +193,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
     def _read_group(
         self, entries: Entries, sound: Mask, members: list[tuple[int, AnyChunk]], wanted: frozenset[int]
     ) -> Iterator[MessageBlock]:
-        """Yield the wanted messages of chunks; what is lost or contradicts itself is added to ``damage``."""
+        """Yield the requested messages of chunks; losses and contradictions are added to ``damage``."""
         found = self.read_excerpt(entries, [chunk for _, chunk in members])
         messages, true = self.read_indexed(found)
         ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
@@ -215,7 +215,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
             yield from self._split_in_time(messages, base + messages.offset)
 
     def read_excerpt(self, entries: Entries, chunks: Sequence[AnyChunk]) -> Excerpt:
-        """Return the messages of chunks with the bytes in which they lie, but for those of chunks that are lost."""
+        """Return the messages of readable chunks, with the bytes that contain them."""
         pieces, offset, size = lay_out_pieces(entries)
         data, lost = np.empty(size, np.uint8).data, []
         for number, of_chunk in pieces.items():
@@ -228,7 +228,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
         return Excerpt(data, offset[kept], entries.at(kept)) if lost else Excerpt(data, offset, entries)
 
     def _copy(self, chunk: AnyChunk, pieces: list[Piece], to: memoryview) -> None:
-        """Copy pieces of a chunk; what need not be read as a whole, to check or decompress it, is not."""
+        """Copy parts of a chunk; read the whole chunk only if it is checked or decompressed."""
         start = self.find_plain_data(chunk)
         if start is not None:
             self._bytes.read_pieces([(start + a, to[at : at + b - a]) for a, b, at in pieces])
@@ -238,7 +238,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
             to[at : at + b - a] = data[a:b]
 
     def _split_in_time(self, messages: Messages, ordinal: Ints) -> list[MessageBlock]:
-        """Return messages as blocks, without those whose time is past what 63 bits hold."""
+        """Return messages as blocks, without those with a time of more than 63 bits."""
         times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
         if not times.all():
             self._note("time-invalid", messages_lost=int((~times).sum()))
@@ -246,7 +246,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
         return messages.blocks(ordinal)
 
     def _note_index_disagreement(self, chunk: AnyChunk, messages: Messages, entries: Entries | None) -> None:
-        """Note where a chunk's index is broken, or names other messages than its records hold."""
+        """Record that a chunk's index is damaged, or differs from its records."""
         lost = 0
         if entries is None and (chunk.size > MAX_PLANNED_BYTES or not self.needs_index(chunk)):
             return
@@ -293,7 +293,7 @@ def sort_by_place(
 
 
 def lay_out_pieces(entries: Entries) -> tuple[dict[int, list[Piece]], Ints, int]:
-    """Return how the pieces of chunks that hold messages are laid one after the other.
+    """Return the order in which the parts of chunks that contain messages are concatenated.
 
     That is the pieces of each chunk by its number; where each message then begins, in the order of the entries; and the
     bytes in all.

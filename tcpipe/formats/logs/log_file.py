@@ -49,7 +49,7 @@ BATCH_BYTES = 1 << 25
 MAX_TOPICS = 10_000
 """A log of more topics is refused; a robot has some hundred. A topic costs a millisecond, however small."""
 MAX_COLUMNS = 200_000
-"""Topics that unfold to more columns together are not read at once; five hundred topics of a robot have some 20,000."""
+"""Largest number of columns of topics that are read together; 500 topics of a robot have about 20,000."""
 
 _HASH_BYTES = 1 << 20
 _LISTED = 5
@@ -139,7 +139,7 @@ def _read_magic(path: Path, fetched: FetchedFile | None) -> bytes:
 
 
 def _read_tail(path: Path, size: int) -> bytes:
-    """Return a file's last bytes; nothing where they cannot be read."""
+    """Return the last bytes of a file; none if they cannot be read."""
     try:
         with path.open("rb") as file:
             file.seek(max(path.stat().st_size - size, 0))
@@ -149,7 +149,7 @@ def _read_tail(path: Path, size: int) -> bytes:
 
 
 def _describe_other_file(path: Path, magic: bytes) -> str:
-    """Say what a file that is no log seems to be."""
+    """Return a guess of the kind of a file that is no log."""
     if not magic:
         return "it is empty (0 bytes)"
     if magic.startswith(b"#ROSBAG V"):
@@ -270,7 +270,7 @@ class Log(OpenLog):
         self._compare_counts(listed)
 
     def _compare_counts(self, listed: Rosbag2Files) -> None:
-        """Note where metadata.yaml counts more messages than the files hold, in all or of topics."""
+        """Record that metadata.yaml counts more messages than the files contain, in total or of a topic."""
         held = {name: topic.message_count or 0 for name, topic in self.topics.items()}
         of_topics = sum(max(count - held.get(name, 0), 0) for name, count in listed.topic_counts.items())
         lost = max((listed.message_count or 0) - sum(held.values()), of_topics)
@@ -279,7 +279,7 @@ class Log(OpenLog):
 
     @property
     def findings(self) -> list[Finding]:
-        """Damage that was found so far, and, as notes, what costs nothing; tables that are read later may add some."""
+        """Damage found so far, with notes on damage without loss; tables that are read later may add more."""
         unchecked = [Damage("no-checksum", part.name, messages_lost=0) for part in self._parts if part.is_unchecked]
         return find_damage([*self._damage, *(damage for part in self._parts for damage in part.damage), *unchecked])
 
@@ -470,7 +470,7 @@ class Log(OpenLog):
                 self._damage.append(Damage(cause, self.path.name, topic=name, messages_lost=0, places=count))
 
     def _merged_topics(self) -> dict[str, Topic]:
-        """Merge the channels of all files by topic; where types differ, the one with most messages holds."""
+        """Merge the channels of all files by topic; if types differ, tcpipe uses the one with most messages."""
         self._channel_of: dict[str, Topic] = {}
         topics: dict[str, Topic] = {}
         channels = [channel for part in self._parts for channel in part.channels.values()]
@@ -545,7 +545,7 @@ def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
 
 
 def _is_other_binary(path: Path) -> bool:
-    """Return whether a .bin is surely no log: other programs write such files, too; an unreadable one may be a log."""
+    """Return whether a .bin file is certainly no log; an unreadable file may be a log."""
     with suppress(LogError):
         return find_autopilot(path) is None
     return False

@@ -1,4 +1,4 @@
-"""Several files of one drive read as one log: parts of a ROS 1 split, or power in a file of its own.
+"""Several files of one drive read as one log: parts of a ROS 1 split, or power in a separate file.
 
 `rosbag record --split` writes ``drive_0.bag``, ``drive_1.bag``, … (often with a time before the number), and static
 transforms only into the part in which they came: a later part that is read alone takes them from the nearest earlier
@@ -61,7 +61,7 @@ class JoinedLog(OpenLog):
 
     @property
     def is_known_by_outline(self) -> bool:
-        """Whether `sha256` holds an outline."""
+        """Whether `sha256` is an outline instead of a hash."""
         return any(log.is_known_by_outline for log in self._logs)
 
     @cached_property

@@ -32,7 +32,7 @@ MAX_CHUNKS = 1 << 20
 MAX_CHANNELS = 1 << 16
 """More channels or connections of a file are refused: MCAP cannot number more."""
 _FEW_RECORDS, _LEAST_RECORD_BYTES = 1 << 20, 4
-"""A file with more records than the first, and than one per so many bytes, is hostile: a message has two times."""
+"""Most records of a file, and fewest bytes per record: with more records, tcpipe rejects the file."""
 _PLAUSIBLE_TOTAL = 1 << 30
 _SEARCH_BYTES = 1 << 20
 
@@ -41,13 +41,13 @@ _PEEK_BYTES = 1 << 13
 _BLOCK_BYTES = 1 << 13
 """Fetched ranges begin and end at multiples of this [byte]."""
 _HELD_BLOCKS = (1 << 26) // _BLOCK_BYTES
-"""Size of the buffer of fetched ranges [byte]: more than a group of chunks that is planned at once."""
+"""Size of the buffer of fetched ranges [byte]: larger than a group of chunks that is planned together."""
 _GAP_BLOCKS = 4
 """Blocks no further apart are fetched as one piece: a request costs as much as some."""
 
 
 class DamageError(Exception):
-    """A piece of a file cannot be used; arguments are as of `Damage`, the cause "" where nothing is damaged."""
+    """A part of a file cannot be used; arguments as in `Damage`, with the cause "" if nothing is damaged."""
 
     def __init__(self, cause: str = "", reason: str = "") -> None:
         super().__init__(cause, reason)
@@ -85,7 +85,7 @@ class LogPart(ABC):
     outline = ""
     """A hash (hex) of the file's size and index, which distinguish it from any other log; "" without an index."""
     is_unchecked = False
-    """Whether no checksum covers some of what was read."""
+    """Whether no checksum covers some of the bytes read."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -94,7 +94,7 @@ class LogPart(ABC):
 
     @abstractmethod
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted channels; what is broken is noted in ``damage`` and stepped over."""
+        """Yield the messages of the requested channels; damaged parts are recorded in ``damage`` and skipped."""
 
     @abstractmethod
     def close(self) -> None:
@@ -113,13 +113,13 @@ class LogPart(ABC):
 
 
 class FetchedFile:
-    """A file in object storage with its stand-in on this machine."""
+    """A file in object storage with its local placeholder."""
 
     def __init__(self, stored: StoredObject, stand_in: Path) -> None:
         self._stored, self._stand_in = stored, stand_in
         self._held: OrderedDict[int, memoryview] = OrderedDict()
         self.is_whole = False
-        """Whether the stand-in holds all of the file by now."""
+        """Whether the placeholder contains the whole file by now."""
 
     def read(self, offset: int, size: int) -> bytes:
         """Return ``size`` bytes at ``offset``, fewer where the file ends before."""
@@ -142,7 +142,7 @@ class FetchedFile:
         self._blocks(wanted)
 
     def whole(self) -> None:
-        """Fetch all of the file to its stand-in, which holds nothing before."""
+        """Fetch the whole file to its placeholder, which is empty before."""
         if not self.is_whole:
             self._stored.copy(self._stand_in)
             self.is_whole = True
@@ -199,7 +199,7 @@ class ByteSource:
         return memoryview(data)
 
     def read_pieces(self, pieces: Sequence[tuple[int, memoryview]]) -> None:
-        """Fill each view with the bytes at its offset; what lies between them is not read. `DamageError` as `read`."""
+        """Fill each view with the bytes at its offset; bytes between them are not read. `DamageError` as `read`."""
         self.skips()
         self.expect([(offset, len(view)) for offset, view in pieces])
         for offset, view in pieces:
@@ -210,7 +210,7 @@ class ByteSource:
         at, held = self._peeked
         if offset < at or offset + size > at + len(held):
             at, held = self._peeked = offset, self._some(offset, max(size, _PEEK_BYTES))
-            if len(held) < size and offset + len(held) < self.size:  # what can be read ends here
+            if len(held) < size and offset + len(held) < self.size:  # end of the readable part
                 return bytes(self.read(offset, min(size, self.size - offset)))
         return held[offset - at : offset - at + size]
 
@@ -228,7 +228,7 @@ class ByteSource:
             start, size = start + size, min(2 * size, _SEARCH_BYTES)
 
     def skips(self) -> None:
-        """Tell the system that this file is read in pieces: what follows a piece need not be read ahead."""
+        """Tell the system that this file is read in parts: it should not read ahead."""
         os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
 
     def expect(self, pieces: Sequence[tuple[int, int]]) -> None:
@@ -250,7 +250,7 @@ class ByteSource:
 
     def _some(self, offset: int, size: int) -> bytes:
         """Return up to ``size`` bytes at ``offset``, at least one unless the file ends there."""
-        if offset > self.size:  # also what no system call takes
+        if offset > self.size:  # also for offsets that no system call accepts
             return b""
         if self._fetched is not None and not self._fetched.is_whole:
             return self._fetched.read(offset, size)
@@ -266,7 +266,7 @@ def outline_of(size: int, index: bytes | memoryview) -> str:
 
 
 def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:
-    """Return whether compressed bytes claim an implausible size; ``whole``: the size to be held in memory at once."""
+    """Return whether compressed bytes claim an implausible size; ``whole``: this size is needed in memory."""
     ratio = _PLAUSIBLE_CHUNK_RATIO if whole else _PLAUSIBLE_RATIO
     return size > _PLAUSIBLE_BYTES and size > ratio * compressed_bytes
 
@@ -281,13 +281,13 @@ class Bounds:
         self._records = 0
 
     def claim(self, chunk_sizes: Iterable[int]) -> None:
-        """Take what all chunks claim to hold [byte]."""
+        """Check the total size that all chunks claim [byte]."""
         total = sum(min(size, MAX_CHUNK_BYTES) for size in chunk_sizes)
         if total > _PLAUSIBLE_TOTAL and is_bomb(self._size, total):
             raise self._bomb(f"its chunks claim to hold {total} bytes in {self._size}")
 
     def walk(self, chunk: int, records: int) -> None:
-        """Take how many records the chunk at a byte of the file holds."""
+        """Add the number of records of a chunk, identified by its offset in the file, and check the total."""
         if chunk not in self._seen:
             self._seen.add(chunk)
             self._records += records
@@ -295,7 +295,7 @@ class Bounds:
             raise self._bomb(f"it contains more than {self.most_records} records in {self._size} bytes")
 
     def count(self, chunks: int, channels: int) -> None:
-        """Take how many chunks and channels there are."""
+        """Check the number of chunks and channels."""
         for count, most, what in ((chunks, MAX_CHUNKS, "chunks"), (channels, MAX_CHANNELS, "topics or connections")):
             if count > most:
                 raise self._bomb(f"it contains more than {most} {what}")
@@ -305,7 +305,7 @@ class Bounds:
 
 
 def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:
-    """Return the ``size`` bytes that ``data`` holds; `DamageError` where it does not decompress, or not to ``size``.
+    """Decompress ``data`` to ``size`` bytes; `DamageError` if that fails, or gives another size.
 
     ``codec`` is ``lz4`` (frames), ``zstd`` or ``bz2``; ``checked``: a checksum of the result is compared afterwards.
     """
@@ -313,7 +313,7 @@ def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False
         raise DamageError("record-damaged")
     _refuse_unknown(codec)
     try:
-        # an LZ4 frame that is too short would leave what lay in memory before, unless a checksum shows that
+        # an LZ4 frame that is too short would leave old memory content, unless a checksum reveals that
         if codec == "zstd" or (codec == "lz4" and checked):
             return memoryview(pa.decompress(pa.py_buffer(data), size, codec=codec)).cast("B")
         with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:

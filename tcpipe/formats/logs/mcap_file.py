@@ -1,7 +1,7 @@
-"""MCAP files: by their summary where it can be trusted, record by record where not, and past what is broken.
+"""Read MCAP files by their summary if it is valid, else record by record; damaged parts are skipped.
 
-A chunk is decompressed only when it holds a wanted channel, its CRC is checked, and the message index beside it (which
-no checksum covers) is believed only as far as the chunk's own records bear it out.
+A chunk is decompressed only if it contains a requested channel, its CRC is checked, and the message index beside it
+(which no checksum covers) is believed only as far as the chunk's own records bear it out.
 """
 
 from collections.abc import Iterator, Sequence
@@ -93,7 +93,7 @@ class McapPart(ChunkedPart[Chunk]):
         yield from super().blocks(wanted)
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
-        """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
+        """Return the chunks that may contain requested channels, each with the number of bytes before it."""
         base, found = 0, []
         for chunk in self._contents.chunks:
             if chunk.index is None or not wanted.isdisjoint(chunk.index):
@@ -104,7 +104,7 @@ class McapPart(ChunkedPart[Chunk]):
         return found
 
     def read_indexed(self, found: Excerpt) -> tuple[Messages, Mask]:
-        """Return the messages of an excerpt, and which of them the chunk holds as its index says."""
+        """Return the messages of an excerpt, and which of them agree with the chunk's index."""
         messages, right = read_messages_at(found.data, found.offset)
         entries = found.entries
         room = entries.end - entries.offset - RECORD_HEAD - MESSAGE_HEAD
@@ -134,11 +134,11 @@ class McapPart(ChunkedPart[Chunk]):
         return messages.at(np.isin(messages.channel, sorted(wanted)))
 
     def is_proved(self, chunk: Chunk) -> bool:
-        """Tell whether the chunk has a CRC."""
+        """Return whether the chunk has a CRC."""
         return bool(self._crc(chunk))
 
     def needs_index(self, chunk: Chunk) -> bool:
-        """Tell whether a broken index is noted: nothing else proves what the chunk holds."""
+        """Return whether a damaged index counts as damage: without a CRC only the index verifies the chunk."""
         return chunk.index is not None and not chunk.cut and not self._crc(chunk)
 
     def find_plain_data(self, chunk: Chunk) -> int | None:
@@ -210,7 +210,7 @@ class McapPart(ChunkedPart[Chunk]):
         return index_entries(self._bytes.read(offset, RECORD_HEAD + length), channel)
 
     def _fill_gaps(self) -> None:
-        """Walk what lies between the chunks that the summary names: message indexes, and messages outside chunks."""
+        """Read the bytes between the chunks of the summary: message indexes, and messages outside chunks."""
         self._complete = True
         listed, self._contents.chunks = self._contents.chunks, []
         position = len(MAGIC)
@@ -222,7 +222,7 @@ class McapPart(ChunkedPart[Chunk]):
         self._note_odd_messages()
 
     def _check_data_section(self, end: int) -> None:
-        """Compare the CRC of all data, if there is one, when messages are outside chunks: nothing else covers these."""
+        """Compare the CRC of all data, if it exists and messages are outside chunks: no other CRC covers these."""
         crc = int.from_bytes(self._bytes.peek(end + RECORD_HEAD, 4), "little")
         if not crc or not any(chunk.headless for chunk in self._contents.chunks):
             return
@@ -400,7 +400,7 @@ class McapPart(ChunkedPart[Chunk]):
         )
 
     def _holding(self, channel: int) -> list[Chunk]:
-        """Return the chunks that hold messages of a channel, by the index."""
+        """Return the chunks that contain messages of a channel, by the index."""
         return [chunk for chunk in self._contents.chunks if chunk.index and channel in chunk.index]
 
     def _times(self, channel: int) -> tuple[int | None, int | None]:

@@ -87,7 +87,7 @@ class Chunk:
 
     @property
     def size(self) -> int:
-        """Bytes of the chunk's records; of compressed ones, what the chunk claims."""
+        """Bytes of the chunk's records; of compressed records, the size that the chunk claims."""
         return self.uncompressed_bytes if self.compression else self.data_bytes
 
     @property
@@ -183,10 +183,10 @@ def index_entries(record: bytes | memoryview, channel: int) -> Ints:
 
 
 def index_messages(data: bytes, records: Ints, ends: Ints, channels: Ints) -> tuple[Mask, Ints, Ints, Ints]:
-    """Read several message indexes at once.
+    """Read several message indexes together.
 
     ``records``, ``ends`` and ``channels`` say of each index, shape (R,), where it begins in ``data``, before which byte
-    it must end, and of which channel it should be. The result says which of the indexes are what they should be, shape
+    it must end, and of which channel it should be. The result is whether each index is valid, shape
     (R,), and of each message of those, shape (N,), the number of its index, its log time [ns] and its offset in the
     chunk.
     """

@@ -63,7 +63,7 @@ _ROS1_NAMES = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Du
 
 
 class DefinitionError(ValueError):
-    """A type has no usable definition; the text says why, plainly."""
+    """A type has no usable definition; the text states the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class MessageType:
     definitions: _Definitions
 
     def text(self, *, ros1: bool) -> str:
-        """Return the definition as text, without comments: for where the log holds none."""
+        """Return the definition as text, without comments, for logs without definitions."""
         texts = dict[str, str]()
         self._add_text(self.wire.name, texts, _ROS1_NAMES if ros1 else {})
         parts = (f"{_SEPARATOR}MSG: {_shorten(name)}\n{text}" for name, text in list(texts.items())[1:])
@@ -125,7 +125,7 @@ class TypeLibrary:
         return self._types[key]
 
     def _resolve(self, type_name: str, definition: str, schema_encoding: str, *, ros1: bool) -> MessageType:
-        known, source = self._known(type_name, definition, schema_encoding)
+        known, source = self._read_definitions(type_name, definition, schema_encoding)
         fallback = functools.partial(self._fallback, ros1=ros1)
         if type_name not in known and fallback(type_name) is None:
             where = (
@@ -140,8 +140,8 @@ class TypeLibrary:
             raise DefinitionError(f"type {type_name} expands to {wire.leaves} columns, more than {MAX_COLUMNS}")
         return MessageType(wire, source, definitions)
 
-    def _known(self, type_name: str, definition: str, schema_encoding: str) -> tuple[_Definitions, Source]:
-        """Return the log's own definitions; none if it has none, or if they are invalid and the user gives the type."""
+    def _read_definitions(self, type_name: str, definition: str, schema_encoding: str) -> tuple[_Definitions, Source]:
+        """Return the definitions of the log; {} without any, or if they are invalid and the user gives the type."""
         given: Source = "given" if type_name in self._own else "bundled"
         if not definition.strip():
             return {}, given
@@ -169,7 +169,7 @@ class _Unfold:
     """Turns parsed definitions into one `Record`, looking up missing types and refusing recursion."""
 
     def __init__(self, known: _Definitions, fallback: Callable[[str], FieldTypes | None], used: _Definitions) -> None:
-        self._known, self._fallback, self._used = known, fallback, used
+        self._read_definitions, self._fallback, self._used = known, fallback, used
         self._records: dict[str, Record] = {}
 
     def record(self, name: str, within: tuple[str, ...]) -> Record:
@@ -178,7 +178,7 @@ class _Unfold:
         if len(within) > _MAX_DEPTH:
             raise DefinitionError(f"type {within[0]} nests more than {_MAX_DEPTH} messages in one another")
         if name not in self._records:
-            entry = self._known[name] if name in self._known else self._fallback(name)
+            entry = self._read_definitions[name] if name in self._read_definitions else self._fallback(name)
             if entry is None:
                 raise DefinitionError(f"type {name}, a part of {within[0]}, is defined neither in the log nor bundled")
             entry = tuple((field, kind) for field, kind in entry if field != _PLACEHOLDER)
@@ -221,7 +221,7 @@ def _parse_definitions(type_name: str, definition: str, schema_encoding: str) ->
 def _parse_msg(type_name: str, definition: str) -> _Definitions:
     try:
         return parse_msg(definition, type_name)
-    except MsgTextError:  # rosbags may know better, and says what is wrong
+    except MsgTextError:  # rosbags may support it, or states the problem
         found = get_types_from_msg(definition.replace("\r\n", "\n"), type_name)
         return {name: _read_rosbags_fields(*described) for name, described in found.items()}
 
@@ -291,7 +291,7 @@ def _read_definitions_of_directory(directory: Path) -> _Definitions:
 
 @cache
 def load_shipped_definitions() -> Mapping[str, str]:
-    """Return the robots' own definitions by type; what they use (std_msgs/Header, duration) is in every type store.
+    """Return the bundled definitions of robots by type; types that they use (std_msgs/Header) are in every type store.
 
     They are the packages' files without constants and comments, which change no byte; NOTICE names packages and
     licences.

@@ -21,7 +21,7 @@ STORAGE_SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 MAX_FILES = 4096
-"""A bag of more files is refused: all are open at once. Split every minute, this is three days."""
+"""Most files of a bag, since all are open at the same time; with a new file each minute, three days."""
 MAX_METADATA_BYTES = 1 << 20
 """Longest metadata.yaml that is read [byte]: its parser takes ten seconds for it, and a bag can be read without it."""
 
@@ -85,7 +85,7 @@ def _find_files_by_metadata(directory: Path, present: tuple[Path, ...], informat
     paths += extra
     count = information.get("message_count")
     damage = [Damage("file-unlisted", f"{directory.name}/{path.name}", messages_lost=0) for path in extra]
-    if len(missing) != len(extra) or not _is_count(count):  # else renamed: the count tells whether anything is lost
+    if len(missing) != len(extra) or not _is_count(count):  # else renamed: the count of messages shows losses
         damage += [Damage("file-missing", f"{directory.name}/{name}") for name in missing]
     if not paths:
         names = ", ".join(listed[:_LISTED]) + (", …" if len(listed) > _LISTED else "")
@@ -152,7 +152,7 @@ def decompress_file(path: Path, directory: Path) -> Path:
 
 
 def _decompress_stream(path: Path) -> Iterator[bytes]:
-    """Yield what a zstd file holds; where it is cut or damaged, or the disk fails, it ends: what follows sees that."""
+    """Yield the content of a zstd file until its end, or until damage or a read error; the reader detects the loss."""
     with suppress(OSError), pa.input_stream(str(path), compression="zstd") as stream:
         while block := stream.read(_COPY_BYTES):
             yield block

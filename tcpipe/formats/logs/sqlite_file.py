@@ -1,8 +1,8 @@
 """The .db3 files of ROS 2: SQLite tables of topics and messages, all schema versions, read without writing.
 
 SQLite has no checksums: a byte flipped inside a message is not noticed here. But every row of the table of messages
-either becomes a message or is counted as damage, and a file whose pages contradict one another is said to be broken. Of
-a damaged file, ids are read upward until an error and downward until an error.
+either becomes a message or is counted as damage, and a file whose pages contradict each other is reported as damaged.
+Of a damaged file, ids are read upward until an error and downward until an error.
 """
 
 import shutil
@@ -24,7 +24,7 @@ MAGIC = b"SQLite format 3\0"
 
 _HEADER_BYTES = 100
 _BLOCK_ROWS, _BLOCK_BYTES = 4096, 1 << 23
-"""A block ends after so many rows, or with the row that makes it longer than so many bytes."""
+"""Most rows of a block, and its size after which no row is added [byte]."""
 _BEFORE_ALL, _LAST_ID = -1e19, 2**63 - 1
 _MOST_HOLES = 1000
 """Most damaged ranges after which reading of a file ends: the end of each is searched."""
@@ -122,7 +122,7 @@ class SqlitePart(LogPart):
         return database
 
     def _refuse_odd_tables(self, path: Path) -> None:
-        """Refuse a file whose topics or messages are no plain tables: what else there is may compute without end."""
+        """Reject a file whose topics or messages are not plain tables: views may compute for an unlimited time."""
         query = "SELECT lower(name), type, rootpage FROM sqlite_schema WHERE lower(name) IN (?, ?, ?)"
         for name, kind, root in self._database.execute(query, _TABLES):
             computed = any(hidden for *_, hidden in self._database.execute(f"PRAGMA table_xinfo({name})"))
@@ -159,7 +159,7 @@ class SqlitePart(LogPart):
         return channels
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
-        """Return encoding and text of each type's definition; files older than ROS 2 Iron hold none."""
+        """Return encoding and text of each type's definition; files older than ROS 2 Iron contain none."""
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT ?"
         try:
             rows = self._database.execute(query, (MAX_CHANNELS,))
@@ -168,7 +168,7 @@ class SqlitePart(LogPart):
             return {}
 
     def _spans(self) -> dict[int, tuple[int, int, int]]:
-        """Return count, first and last log time by topic, and note invalid rows; of a damaged file, what is reached."""
+        """Return count, first and last log time by topic; invalid or unreadable rows are recorded as damage."""
         _, is_message = self._message_columns()
         by_topic = "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages NOT INDEXED"
         try:
@@ -193,7 +193,7 @@ class SqlitePart(LogPart):
         return spans
 
     def _message_columns(self) -> tuple[str, str]:
-        """Return the columns of a message (row id, topic, log time, publish time, data), and what makes a row valid."""
+        """Return the columns of a message (row id, topic, log time, publish time, data), and the test of a row."""
         columns = {row[1] for row in self._database.execute("PRAGMA table_info(messages)")}
         publish = "send_timestamp" if "send_timestamp" in columns else "timestamp"
         kinds = {"id": "integer", "topic_id": "integer", "timestamp": "integer", publish: "integer", "data": "blob"}

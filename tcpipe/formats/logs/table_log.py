@@ -6,8 +6,8 @@ beside a bag.
 Tables that others wrote, as CSV, text in columns (TUM trajectories, RTKLIB's .pos) or Parquet: polars' lazy scan,
 columns by name.
 
-A table of text is described by its first lines: what separates its fields, what its columns are called (`column_1` and
-so on where it has no header), what is comment. A cell that is no number where one is wanted is counted, never guessed.
+The first lines of a text table determine its separator, the names of its columns (`column_1` and so on without a
+header), and its comments. A cell that should be a number and is not is counted, never guessed.
 """
 
 import re
@@ -52,7 +52,7 @@ def open_tables(path: Path, mappings: Mappings, files: Sequence[Path] | None = N
 
 
 def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> TopicMessages | list[str]:
-    """Return a table's messages, or all problems of its mapping; ``zone`` is that of times without one, or ""."""
+    """Return a table's messages, or all problems of its mapping; ``zone`` is used for times without one ("": none)."""
     where = f"recipe tables.{name}"
     role = mapping.role or name
     problems = list(find_mapping_problems(where, role, mapping.columns, mapping.units))
@@ -60,9 +60,9 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
     if not is_table(mapping.file):
         problems.append(f"{where}.file is {mapping.file!r}; expected a name that ends in {', '.join(TABLE_SUFFIXES)}")
     elif not path.is_file():
-        held = ", ".join(str(file.relative_to(folder)) for file in list_table_files(folder)[:20])
+        present = ", ".join(str(file.relative_to(folder)) for file in list_table_files(folder)[:20])
         problems.append(
-            f"{where}.file: there is no {mapping.file} here; there are {held or 'no tables at all'}. "
+            f"{where}.file: there is no {mapping.file} here; there are {present or 'no tables at all'}. "
             f"Add it, or ingest this run with a recipe without tables.{name}"
         )
     if problems:
@@ -79,8 +79,10 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
         ]
         if isinstance(fields, list) or problems:
             return problems
-        of_stamps = (stamp, mapping.stamp_utc, mapping.stamp_date)
-        cells, values = read_column_values(path, [column for column in of_stamps if column and column in names], fields)
+        stamp_columns = (stamp, mapping.stamp_utc, mapping.stamp_date)
+        cells, values = read_column_values(
+            path, [column for column in stamp_columns if column and column in names], fields
+        )
     except LogError as error:
         return [problem.removeprefix(f"{folder}/") for problem in error.problems]
     empty = [
@@ -136,7 +138,7 @@ def _read_messages(
 
 
 def _find_clock_mismatch(read: Iterable[TopicMessages]) -> Iterator[str]:
-    """Yield a line for tables without times in common with the longest: they have another clock or drive."""
+    """Yield a line for each table that does not overlap the longest one in time: another clock, or another drive."""
     spans = {found.topic.name: (found.topic.start_ns or 0, found.topic.end_ns or 0) for found in read}
     longest = max(spans, key=lambda name: spans[name][1] - spans[name][0], default="")
     for name, (first_ns, last_ns) in spans.items():
@@ -185,13 +187,13 @@ def _report_unreadable(path: Path) -> Iterator[None]:
 
 
 def read_table_header(path: Path) -> list[str]:
-    """Return what the columns of a table are called; `LogError` where it cannot be read."""
+    """Return the names of a table's columns; `LogError` if it cannot be read."""
     with _report_unreadable(path):
         return _scan(path).collect_schema().names()
 
 
 def describe_duplicates(names: Sequence[str]) -> dict[str, str]:
-    """Return a remark on each column whose name the header has several times."""
+    """Return a note on each column name that the header contains several times."""
     seconds = {name: f"{name}_duplicated_0" for name in names if name and f"{name}_duplicated_0" in names}
     return {
         name: f"several columns are called {name}: the first is read, {second} is the next"
@@ -238,7 +240,7 @@ def read_column_values(
 def _collect_columns(
     path: Path, columns: list[str], numbers: list[str] | None, *, rows: int | None = None
 ) -> pl.DataFrame:
-    """Return columns of a table; a quote that nothing closes (a log that broke off) costs its own line only."""
+    """Return columns of a table; an unclosed quote (truncated log) only loses its own line."""
     try:
         return _scan(path, numbers).select(columns).slice(0, rows).collect()
     except pl.exceptions.ComputeError:
@@ -246,7 +248,7 @@ def _collect_columns(
 
 
 def _find_non_number(path: Path, name: str) -> tuple[int, int, str] | None:
-    """Return how many cells of a column hold what is no number, and the row (from 1) and text of the first."""
+    """Return the number of cells that are no numbers, and row (from 1) and text of the first."""
     texts = _collect_columns(path, [name], numbers=None)[name].cast(pl.String)
     odd = texts.is_not_null() & (texts.str.strip_chars() != "") & texts.cast(pl.Float64, strict=False).is_null()
     rows = odd.arg_true()
@@ -254,7 +256,7 @@ def _find_non_number(path: Path, name: str) -> tuple[int, int, str] | None:
 
 
 def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '"') -> pl.LazyFrame:
-    """Return a table's lazy frame, with ``numbers`` read as such; None reads every cell of a text as it stands."""
+    """Return a table's lazy frame, with ``numbers`` read as such; None reads all cells as text."""
     if path.suffix == ".parquet":
         return pl.scan_parquet(path)
     with path.open("rb") as file:

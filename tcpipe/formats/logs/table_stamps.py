@@ -26,7 +26,7 @@ _GPS_TIME = "GPST"
 _OF_UTC = re.compile(r"(.*_)?(utc|gmt|zulu)(_.*)?")
 _OF_DAY = re.compile(r"(.*_)?ms_(today|of_day)")
 _COUNTERS = {"millis": "ms", "micros": "us", **{unit: unit for unit in STAMP_UNITS}}
-"""Units of counters whose column is called like a unit, or like a function of a microcontroller."""
+"""Units of counters, by column names that are a unit or a function of a microcontroller."""
 _DATE_IN_NAME = re.compile(r"(?<!\d)(20\d\d)([-_.]?)([01]\d)\2([0-3]\d)(?!\d{3})")
 _DAY_NS = 86_400_000_000_000
 _SAMPLE_ROWS = 1000
@@ -103,7 +103,7 @@ def _read_stamps(
 
 
 def _read_dated(column: pl.Series, dates: pl.Series | None, *, form: str = "", unit: str = "auto") -> Clock | str:
-    """Return what a column counts, with the column of dates if it has times of day; or a text why it is no clock."""
+    """Return the unit of a column of times, and the column of dates for times of day; or why it is no clock."""
     clock = read_clock(column, form=form, unit=unit)
     if dates is None or column.dtype not in (pl.String, pl.Time) or getattr(clock, "kind", "day") != "day":
         return clock
@@ -112,7 +112,7 @@ def _read_dated(column: pl.Series, dates: pl.Series | None, *, form: str = "", u
 
 
 def read_clock(column: pl.Series, *, form: str = "", unit: str = "auto") -> Clock | str:
-    """Return what a column counts, or in words why it is no clock.
+    """Return the unit of a column of times, or the reason why it is no clock.
 
     ``form`` is the recipe's ``stamp_format`` of texts, ``unit`` its ``stamp_unit`` of numbers.
     """

@@ -2,8 +2,8 @@
 
 The home of mcap's writer and of rosbags on the writing side. Every message of a stream has one layout (its strings and
 sequences keep their lengths), so that one example is serialised by rosbags and the rest are copies of its bytes with
-the columns patched in; where a field lies is found by serialising it twice with different bytes, not by a second model
-of the encoding.
+the columns patched in; the position of a field is found by serialising it twice with different bytes, not by a second
+model of the encoding.
 """
 
 import functools
@@ -38,9 +38,9 @@ _MISSING_IN_ROSBAGS = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped
 class MessageStream:
     """One topic, ready to be written.
 
-    ``columns`` hold what differs from message to message, by dotted field name, one row a message: numbers, arrays of
-    one length (second axis), or bytes of one length for strings. ``constants`` hold the rest by dotted name (lists of
-    dicts for lists of messages); what neither names is zero or empty.
+    ``columns`` contain the fields that vary, by dotted name, one row per message: numbers, arrays of
+    one length (second axis), or bytes of one length for strings. ``constants`` contain constant fields by dotted name
+    (lists of dicts for lists of messages); all other fields are zero or empty.
     """
 
     topic: str
@@ -51,7 +51,7 @@ class MessageStream:
     publish_time_ns: Ints | None = None
     latched: bool = False
     definition: str = ""
-    """Text of a type that neither rosbags nor `load_shipped_definitions` knows."""
+    """Definition of a type that is neither in rosbags nor in `load_shipped_definitions`."""
 
 
 def write_mcap(path: Path, streams: Sequence[MessageStream], *, encoding: Encoding = "cdr") -> None:
@@ -144,7 +144,7 @@ def _serialize_messages(stream: MessageStream, encoding: Encoding) -> Bytes:
 
 
 def _check_lengths(topic: str, columns: NamedArrays) -> None:
-    """Refuse what cannot be patched in: strings of several lengths, and arrays of Python objects."""
+    """Reject values that cannot be patched in: strings of several lengths, and arrays of Python objects."""
     for name, values in columns.items():
         ragged = values.dtype.kind == "S" and (np.char.str_len(values) != values.dtype.itemsize).any()
         if ragged or values.dtype.kind not in "biufS":

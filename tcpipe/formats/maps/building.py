@@ -47,7 +47,7 @@ from tcpipe.terrain.projection import parse_crs
 from tcpipe.terrain.target_grid import MapGrid, choose_crs, choose_grid, find_projection
 
 Files = Path | Sequence[Path]
-"""One file of a layer, or all; the last lies on top."""
+"""One file of a layer, or all files; the last one has priority."""
 
 LayerSource = RasterLayer | PolygonLayer
 """Source of a layer of a map."""
@@ -81,7 +81,7 @@ def build_map(
     pixel_size_m: float | None = None,
     inputs: MapInputs | None = None,
 ) -> MapFacts:
-    """Put rasters on one common grid and write them as a map; nothing is left behind if that fails.
+    """Put rasters on one common grid and write them as a map; nothing remains if that fails.
 
     Parameters
     ----------
@@ -90,11 +90,11 @@ def build_map(
         grid (`layer_building`); terrain also as GeoJSON polygons (`terrain_polygons`).
     more : other layers, put on the grid of these three.
     classes : class table (CSV or TOML); None takes ``agreed``, the classes of the store's other maps, else the paper's
-        seven classes. Where the terrain raster names its values, those names say which class each is.
+        seven classes. If the terrain raster names its values, these names determine the classes.
     crs : the map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's,
     or its UTM zone.
     pixel_size_m : side of a map pixel [m]; None takes the finest raster's.
-    inputs : what the caller wants to know the map by later; kept in its facts.
+    inputs : identity of the inputs for later comparison, stored in the map's facts.
 
     `MapError`: a raster has no CRS, cannot be read, or holds nothing here; the class table is not the store's: one line
     each.
@@ -243,7 +243,7 @@ def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -
 
 
 def _find_assumed(terrain: LayerSource | None) -> Findings:
-    """Return the finding, if any, that terrain values are read as the paper's classes although nothing names them."""
+    """Return the finding, if any, that terrain values are read as the paper's classes although no table names them."""
     values = [] if terrain is None else terrain.values
     known = [f"{entry.id} as {entry.name}" for entry in PAPER_SCHEME.table.classes if entry.id in values]
     if not known:
@@ -253,7 +253,7 @@ def _find_assumed(terrain: LayerSource | None) -> Findings:
 
 
 def _make_facts(grid: MapGrid, layers: Mapping[str, LayerSource], classes_from: str, inputs: MapInputs) -> MapFacts:
-    """Return what was found; layers that keep their own pixels may reach beyond the map."""
+    """Return the findings; layers with their own pixel size may extend beyond the map."""
     covered = {}
     for role, layer in layers.items():
         pixels = layer.tally.pixels * (layer.grid.pixel_size_m / grid.pixel_size_m) ** 2
@@ -274,7 +274,7 @@ def _make_facts(grid: MapGrid, layers: Mapping[str, LayerSource], classes_from: 
 
 
 def _compute_class_shares(source: LayerSource) -> dict[str, float]:
-    """Return the share of each class that occurs among the pixels that have one; nothing of a layer without classes."""
+    """Return the share of each class that occurs among the pixels that have one; {} for a layer without classes."""
     counts, classes = source.tally.by_class, source.layer.classes
     total = max(int(counts[1:].sum()), 1)
     entries = () if classes is None else classes.classes
@@ -292,7 +292,7 @@ _TRUTH = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0"
 
 
 def read_class_scheme(path: Path) -> ClassScheme:
-    """Read a class table and the raster values of its classes; `MapError`: one problem a wrong line, all at once."""
+    """Read a class table and the raster values of its classes; `MapError`: one problem for each wrong line."""
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:

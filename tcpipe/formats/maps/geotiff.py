@@ -1,6 +1,6 @@
 """GeoTIFF, JPEG 2000 and ERDAS Imagine, as windows of numbers with their validity: the one home of rasterio.
 
-GDAL opens whatever a file's content says, also what is on another disk or another continent. So tcpipe checks a user's
+GDAL opens every file that a raster refers to, also on other disks or servers. Therefore tcpipe checks a user's
 file first: its first bytes determine its one driver, and the files of its name in the same folder must be plain too.
 Virtual rasters (VRT), which name other files, are not supported.
 
@@ -59,7 +59,7 @@ _METRES |= dict.fromkeys(("usft", "ftus", "footus", "usfoot", "ussft", "surveyfo
 
 GDAL_CONFIG = {
     "GDAL_CACHEMAX": 256_000_000,  # [byte] decoded blocks: many windows need a strip of a wide raster
-    "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",  # what lies beside is asked for by name, as `_refuse_beside` does
+    "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",  # files beside the raster are requested by name, see `_refuse_beside`
     "GDAL_VRT_ENABLE_PYTHON": "NO",
     "GDAL_PAM_ENABLED": "YES",
     "CPL_VSIL_CURL_ALLOWED_FILENAME": "none",
@@ -138,7 +138,7 @@ class Tile:
     unit: str
     """Unit of numbers by the file; empty if the file states no unit."""
     opaque: Mask | None
-    """Which indices of a palette can be seen."""
+    """Whether each index of a palette is visible."""
 
 
 OpenFile = Callable[[Path, str], Any]
@@ -159,7 +159,7 @@ def keep_open() -> Iterator[OpenFile]:
 def read_window(  # noqa: PLR0917
     open_file: OpenFile, tile: Tile, row0: int, row1: int, col0: int, col1: int, shape: tuple[int, int] | None = None
 ) -> tuple[AnyArray, Mask]:
-    """Return a window of a tile, and which of its pixels have data; `MapError`: they are damaged, or the file is gone.
+    """Return a window of a tile, and which of its pixels have data; `MapError`: damaged, or missing file.
 
     Values are float64 metres or numbers, float64 grey or colour from 0 to 255, or raw integers of classes. If the
     ``shape`` is smaller than the window, GDAL takes the nearest pixels, from the file's overviews if it has any.
@@ -350,7 +350,7 @@ def _open(path: Path, driver: str) -> Any:
 
 
 def describe_raster_error(error: BaseException) -> str:
-    """Return the first line of what GDAL says."""
+    """Return the first line of an error of GDAL."""
     return str(error.__cause__ or error).splitlines()[0][:200]
 
 
@@ -505,7 +505,7 @@ def write_geotiff(
         profile |= {"photometric": "RGB", "alpha": "YES"}
     with write_atomic_file(path) as temporary:
         with rasterio.open(temporary, "w", **profile) as dataset:
-            if palette is not None:  # before the first pixel: GDAL cannot change what is on disk already
+            if palette is not None:  # before the first pixel, since GDAL cannot change it later
                 dataset.write_colormap(1, {value: (*colour, 255) for value, colour in palette.items()})
             for first in range(0, grid.rows, _STRIP_ROWS):
                 last = min(first + _STRIP_ROWS, grid.rows)
@@ -516,7 +516,7 @@ def write_geotiff(
 
 @contextmanager
 def _convert_late_errors() -> Iterator[None]:
-    """Turn what GDAL says of a file that it wrote into an `OSError` of writing; its errors have no common base."""
+    """Convert errors of GDAL while it writes into `OSError`; its errors have no common base class."""
     try:
         yield
     except Exception as error:
@@ -540,7 +540,7 @@ def write_cog(
     dtype: str,
     bands: Sequence[tuple[str, str]],
 ) -> None:
-    """Write a Cloud-Optimised GeoTIFF as `write_geotiff`; overviews hold every second pixel, nothing is averaged.
+    """Write a Cloud-Optimised GeoTIFF as `write_geotiff`; overviews contain every second pixel, without averaging.
 
     ``bands`` are names and units.
     """

@@ -1,7 +1,7 @@
 """One layer of a map: its raster (one file, or tiles on one grid) or polygons, resampled shard by shard and counted.
 
-Tiles share CRS, type, bands and grid (to a twentieth of a pixel). Where they overlap, the later file lies on top
-wherever it has data, as with gdalwarp; what no tile covers has no data. A few files are open at one time, however many
+Tiles share CRS, type, bands and grid (to a twentieth of a pixel). Where they overlap, the later file has priority
+where it has data, as with gdalwarp; ground without a tile has no data. A few files are open at one time, however many
 there are.
 """
 
@@ -30,7 +30,7 @@ MAX_FILES = 100_000
 """Most files of one layer."""
 
 _OFF_GRID_PX = 0.05
-"""Tiles whose corners are farther from the pixels of the rest do not lie on one grid [px]."""
+"""Largest offset of a tile's corners from the pixels of the others for one common grid [px]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Raster:
     role: str
     unit: str
     georeference: Georeference
-    """Where it lies; its name, for messages, is the path, and how many more there are."""
+    """Georeference; its name, for messages, is the path and the number of further files."""
     findings: Findings
     """One a code, of the first tile that has it."""
     names: Mapping[int, str]
@@ -104,7 +104,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile,
             problems += error.problems
     if problems:
         raise MapError(*shorten_problems(problems))
-    if crs is not None:  # stands in for a local CRS
+    if crs is not None:  # placeholder of a local CRS
         tiles = [replace(tile, crs="") if tile.crs and CRS(tile.crs).is_engineering else tile for tile in tiles]
     known = {text: parse_crs(text, where=label) for text in dict.fromkeys(tile.crs for tile in tiles) if text}
     _refuse_odd(tiles, "CRS", _find_crs_keys(tiles), "rio warp in.tif out.tif --dst-crs EPSG:n")
@@ -127,12 +127,12 @@ def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile,
 
 
 def label_files(paths: Sequence[Path]) -> str:
-    """Return what files are called in a message: the first, the last and how many there are."""
+    """Return files as text for a message: the first, the last, and their number."""
     return str(paths[0]) if len(paths) == 1 else f"{paths[0]} … {paths[-1].name} ({len(paths)} files)"
 
 
 def _find_crs_keys(tiles: Sequence[Tile]) -> list[str]:
-    """Return by tile the first WKT that says the same as its own."""
+    """Return, for each tile, the first WKT that is equivalent to its own."""
     first: dict[str, str] = {"": ""}
     for text in dict.fromkeys(tile.crs for tile in tiles if tile.crs):
         same = (known for known in first if known and CRS(known).equals(CRS(text), ignore_axis_order=True))
@@ -158,7 +158,7 @@ def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, fl
     pixels = [tuple(f"{tile.affine[n]:.6g}" for n in (0, 1, 3, 4)) for tile in tiles]
     base = pixels.index(Counter(pixels).most_common(1)[0][0])
     at, off = _find_grid_positions(tiles, base)
-    if off.sum() > len(tiles) / 2:  # it is the odd one itself
+    if off.sum() > len(tiles) / 2:  # the first tile is the different one
         base = next((n for n in np.flatnonzero(off).tolist() if pixels[n] == pixels[base]), base)
         at, off = _find_grid_positions(tiles, base)
     odd = [tile for tile, far in zip(tiles, off, strict=True) if far]
@@ -193,7 +193,7 @@ def _find_grid_positions(tiles: Sequence[Tile], base: int) -> tuple[Floats, Mask
 
 
 def _join_value_names(tiles: Sequence[Tile]) -> dict[int, str]:
-    """Return what the tiles' values are called; `MapError` if two call one value otherwise."""
+    """Return the names of the tiles' values; `MapError` if two tiles name a value differently."""
     names: dict[int, str] = {}
     for tile in tiles:
         for value, name in tile.names.items():
@@ -207,9 +207,9 @@ def _join_value_names(tiles: Sequence[Tile]) -> dict[int, str]:
 _BLOCK_PX = 1024
 _HIGHEST_M = 9_000.0
 _DEEPEST_M = -500.0
-"""Dry land lies between these."""
+"""Lowest and highest dry land [m]."""
 _MEAN_FROM = 1.5
-"""From so many source pixels a map pixel on, a layer is averaged instead of interpolated."""
+"""Fewest source pixels per map pixel for averaging a layer; with fewer it is interpolated."""
 _LISTED = 8
 _NAMED = 3
 _ISOLATED, _NARROW = "value-isolated", "ortho-range-narrow"
@@ -420,7 +420,7 @@ class RasterLayer:
 
 
 def split_colours(ortho: Raster) -> dict[str, Raster]:
-    """Return the colours of an orthophoto as rasters by layer; nothing of a grey one. Its findings are not repeated."""
+    """Return the colours of an orthophoto as rasters by layer; {} for a grey one. Its findings are not repeated."""
     if len(ortho.tiles[0].bands) == 1 and "palette" not in ortho.tiles[0].kind:
         return {}
     colours = dict[str, Raster]()

@@ -84,7 +84,7 @@ _SHARES = 5
 
 
 def map_lines(summary: MapSummary) -> list[str]:
-    """Return where a map lies and what each layer holds."""
+    """Return the georeference of a map and the content of each layer."""
     rows, cols, pixel_size_m = summary.rows, summary.cols, summary.pixel_size_m
     crs = summary.crs if len(summary.crs) < 20 else "a CRS of its own"
     lines = [
@@ -120,7 +120,7 @@ def _format_percent(share: float) -> str:
 
 
 _VALUE_USAGES = ("5", "3")
-"""GDAL's GFU_MinMax, GFU_Min: the column that holds the value (or where a range of values begins)."""
+"""GDAL's GFU_MinMax, GFU_Min: the column of the value (or of the start of a range)."""
 _UPPER_USAGE = "4"
 _NAME_USAGE = "2"
 _STRING_TYPE = "2"
@@ -186,7 +186,7 @@ class _LayerDescription:
 
 
 def make_cf_flags(classes: ClassTable | None) -> dict[str, Value]:
-    """Return what CF says of classes: their ids, and their names without a space."""
+    """Return the CF attributes of classes: their ids, and their names without spaces."""
     entries = () if classes is None else classes.classes
     names = " ".join(entry.name.replace(" ", "_") for entry in entries)
     return {"flag_values": [entry.id for entry in entries], "flag_meanings": names}

@@ -13,8 +13,8 @@ x, y         float64  pixel centres in the map's CRS [m]
 spatial_ref  int64    CF grid mapping: the CRS as WKT, and GDAL's GeoTransform
 ===========  =======  ==========================================================================
 
-The groups ``overviews/2``, ``overviews/4`` … hold the same arrays at coarser levels (`tcpipe.terrain.resampling`), and
-the array ``overviews/rgb`` is the small picture that pages show of an orthophoto in colour. Attributes follow CF
+The groups ``overviews/2``, ``overviews/4`` … contain the same arrays at coarser levels (`tcpipe.terrain.resampling`),
+and the array ``overviews/rgb`` is the small picture that pages show of an orthophoto in colour. Attributes follow CF
 (``grid_mapping``, ``flag_values``) and GeoZarr (``proj:``, ``spatial:``), so that xarray opens map and overviews as
 they are, and so does GDAL from 3.13 on, the first that reads shards.
 """
@@ -68,7 +68,7 @@ TILE_PX = 512
 """Side of a tile: the unit that is decoded."""
 
 SHARD_PX = 2048
-"""Side of a shard: the unit that is a file, and that is written at once."""
+"""Side of a shard [px]: one file, written as a whole."""
 
 PICTURE_PX = 900
 """Longest side of a map's pictures: the width of a page [px]."""
@@ -113,7 +113,7 @@ class MapFile(MapReader):
         return replace(self, grid=make_overview_grid(self.grid, factor), factors=(1,), _factor=factor)
 
     def summary(self) -> MapSummary:
-        """Return what the map is as a whole."""
+        """Return the description of the whole map."""
         grid = self.grid
         return convert_record(
             self.facts,
@@ -152,13 +152,13 @@ class MapFile(MapReader):
         with _name_damage(f"map {self.name}: {layer}, {where}"):
             array = self._levels[self._factor][layer]
             array.chunk((i, j), out=out)
-        out[max(grid.rows - i * side, 0) :] = array.fill  # what a file holds beyond its array is nobody's promise
+        out[max(grid.rows - i * side, 0) :] = array.fill  # a file may contain more than its array
         out[:, max(grid.cols - j * side, 0) :] = array.fill
 
 
 @contextmanager
 def _name_damage(what: str) -> Iterator[None]:
-    """Say which part of a map it was that could not be read."""
+    """Add the part of the map that cannot be read to errors."""
     try:
         yield
     except StoreError as error:
@@ -336,7 +336,7 @@ def _put(array: Any, row0: int, col0: int, values: Pixels) -> None:
 
 
 def _place(group: Any, grid: MapGrid, title: str) -> None:
-    """Say where a group's pixels lie: coordinates, the grid mapping, and the same as attributes."""
+    """Write the georeference of a group's pixels: coordinates, grid mapping, and attributes."""
     crs = CRS(grid.crs)
     _add_axis(group, "x", grid.x_min_m + (np.arange(grid.cols) + 0.5) * grid.pixel_size_m)
     _add_axis(group, "y", grid.y_max_m - (np.arange(grid.rows) + 0.5) * grid.pixel_size_m)

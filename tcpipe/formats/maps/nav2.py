@@ -23,10 +23,10 @@ from tcpipe.formats.json_files import Json
 from tcpipe.terrain.target_grid import MapGrid
 
 LETHAL = 100
-"""Cost of what is never crossed."""
+"""Cost of cells that are never crossed."""
 
 HIGHEST = 98
-"""Largest cost of what can be crossed: current static layers take 99 for inscribed, which is an obstacle."""
+"""Largest cost of cells that can be crossed: static layers read 99 as inscribed, which is an obstacle."""
 
 _OCCUPIED = 0.995
 """Between the darkest grey of `HIGHEST` and black."""
@@ -96,7 +96,7 @@ def format_nav2_parameters(*, quantity: str, unit: str, lowest: float, highest: 
 
     Parameters
     ----------
-    quantity, unit, lowest, highest : what a cost is, and the values of the costs 0 and `HIGHEST`.
+    quantity, unit, lowest, highest : quantity and unit of the cost, and its values at cost 0 and `HIGHEST`.
     speed_step_mps : speed of one step of the speed mask [m/s].
     """
     multiplier = max(highest / lowest - 1.0, 0.0) if lowest > 0.0 else 0.0
@@ -218,7 +218,7 @@ def read_route_graph(path: Path) -> RouteGraph:
 
 
 def _read_node(feature: Json, problems: list[str]) -> Iterator[tuple[int, tuple[float, float]]]:
-    """Yield id and place of a node, or add what is wrong with it to ``problems``."""
+    """Yield id and position of a node, or add its problem to ``problems``."""
     node, place = _get(feature, "properties").get("id"), _get(feature, "geometry").get("coordinates")
     numbers = [value for value in place[:2] if _is_finite(value)] if isinstance(place, list) else []
     if not _is_id(node):
@@ -230,7 +230,7 @@ def _read_node(feature: Json, problems: list[str]) -> Iterator[tuple[int, tuple[
 
 
 def _read_edge(feature: Document, nodes: Container[int], problems: list[str]) -> Iterator[RouteEdge]:
-    """Yield an edge, or add what is wrong with it to ``problems``."""
+    """Yield an edge, or add its problem to ``problems``."""
     properties = _get(feature, "properties")
     ids = [value for name in ("id", "startid", "endid") if _is_id(value := properties.get(name))]
     if len(ids) < 3:

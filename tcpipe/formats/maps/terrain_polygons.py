@@ -59,7 +59,7 @@ class PolygonLayer:
     ids: Bytes
     findings: Findings
     values: Sequence[int]
-    """Numbers that stand for classes in the file, in place of names."""
+    """Numbers of classes in the file, if it has no names."""
     _tree: shapely.STRtree = field(repr=False)
     tally: Tally = field(default_factory=Tally)
 
@@ -77,7 +77,7 @@ class PolygonLayer:
         return burn_polygons(polygons[kept], self.ids[drawn][kept], part)
 
     def list_findings(self) -> Findings:
-        """Return what was observed when they were placed."""
+        """Return the findings of placing the polygons on the map."""
         return self.findings
 
 
@@ -91,10 +91,10 @@ def is_drawn(paths: Sequence[Path]) -> bool:
 
 
 def place_polygons(paths: Sequence[Path], scheme: ClassScheme, crs: CRS, grid: MapGrid) -> PolygonLayer:
-    """Read terrain polygons and project them to the CRS of a map's grid; later features lie on top.
+    """Read terrain polygons and project them to the CRS of a map's grid; later features have priority.
 
     `MapError`: not GeoJSON, another CRS, invalid geometry, a class that the table does not have, or nothing on the map:
-    all problems at once.
+    all problems in one error.
     """
     every, problems = _read_all(paths)
     features = [feature for feature in every if feature.polygons and _find_class(feature) is not None] or every

@@ -55,7 +55,7 @@ class BuildResult:
     recipe: str = ""
     """The recipe's source, as a command found it."""
     segments: int | None = None
-    """Number of segments of a dry run: at most so many samples."""
+    """Number of segments in a dry run: an upper bound of the samples."""
     foreign_files: tuple[str, ...] = ()
     """Files in its directory that tcpipe did not write, and keeps."""
 
@@ -134,7 +134,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
 
 
 def _plan(state: State, store: Store, options: BuildDatasetOptions, place: Location) -> BuildResult:
-    """Return what a call would do."""
+    """Return the plan of a call."""
     job = _read_job(state, store, options, place)
     if job.is_made and job.known is not None:
         return _make_result(place, "unchanged", job.known, job.left_out, ())
@@ -154,7 +154,7 @@ class _Job:
     known: DatasetCard | None
     """Card of the existing dataset at the output, or None."""
     is_made: bool
-    """Whether that is what would be made now."""
+    """Whether the existing dataset is up to date."""
 
 
 def _read_job(state: State, store: Store, options: BuildDatasetOptions, place: Location) -> _Job:
@@ -210,14 +210,14 @@ def _describe_options(options: BuildDatasetOptions) -> Options:
 
 
 _NOT_RECORDED = ("out", "store", "jobs", "dry_run", "force")
-"""Options of a call that do not decide what the dataset is made of."""
+"""Options of a call without effect on the content of the dataset."""
 _IN_PYTHON = "a recipe in Python"
 
 
 def find_changed_parts(store: Store, state: State, output: Output) -> str:
     """Return the parts of a dataset that a build would change now, or why it cannot be planned; "" without a change.
 
-    A dataset whose recipe was given in Python is taken for unchanged.
+    A dataset whose recipe was given in Python is assumed unchanged.
     """
     if not output.inputs or output.options.get("recipe") == _IN_PYTHON:
         return ""
@@ -233,7 +233,7 @@ def find_changed_parts(store: Store, state: State, output: Output) -> str:
 
 
 def _record_output(call: RunningCall, output: Output, before: Output) -> None:
-    """Write what an output is made of and how the last call for it ended; nothing if that is known."""
+    """Write the inputs of an output and the result of its last call, unless they are already written."""
     if to_plain(replace(output, at="")) == to_plain(replace(before, at="")):
         return
     try:
@@ -264,7 +264,7 @@ def _refuse_others_since(place: Location, expected: Container[str | None]) -> No
 
 
 def _find_foreign_files(place: Location, card: DatasetCard | None) -> tuple[str, ...]:
-    """Return the files of others in the directory of a dataset; in a bucket each build has a folder of its own."""
+    """Return the files of others in the directory of a dataset; in a bucket each build has its own folder."""
     return tuple(find_foreign_files(place, card.checksums)) if isinstance(place, Path) and card is not None else ()
 
 
@@ -326,7 +326,7 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
 
 @contextmanager
 def _name_remedy(place: Location) -> Iterator[None]:
-    """Add to a `DatasetError` about the card in a place what becomes of the dataset there, and what to do."""
+    """Add to a `DatasetError` about a card the state of its dataset, and what to do."""
     try:
         yield
     except DatasetError as error:

@@ -100,7 +100,7 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> ChosenIn
 
 
 def plan_inputs(store: Store, options: BuildOptions, state: State) -> DatasetInputs:
-    """Return what a dataset would be made of, by the documents alone; `DatasetError` as `choose_inputs`."""
+    """Return the inputs of a dataset from the documents alone; `DatasetError` as `choose_inputs`."""
     chosen = choose_runs(store, options.recipe, state=state, robot=options.robot, tags=options.tags, prove=False)
     return _describe_inputs(options, chosen.runs, choose_maps(store, state, options))
 
@@ -153,7 +153,7 @@ def _refuse_without_segments(runs: Sequence[StoredRun]) -> None:
 def prove_maps(store: Store, maps: Sequence[StoredMap]) -> None:
     """Compare the maps' files with their documents; `MapError` for a changed or lost file, which reads as no data."""
     root = store.place.path
-    if root is None:  # what is read from a bucket is verified when it is fetched
+    if root is None:  # files in a bucket are verified when they are fetched
         return
     for record in maps:
         folder = root / BLOBS / record.blob
@@ -342,7 +342,7 @@ def _is_one_drive(pair: tuple[StoredRun, StoredRun]) -> bool | None:
     """
     files = [dict[str, Path](), dict[str, Path]()]
     for number, run in enumerate(pair):
-        with suppress(StoreError):  # a stream that is not as it was written proves nothing
+        with suppress(StoreError):  # a changed stream proves nothing
             files[number] = run.stream_files()
     sensors = [run.facts.sensors for run in pair]
     for role in (role for role in _COMPARED_ROLES if all(role in found for found in files)):
@@ -396,7 +396,7 @@ def _find_overlapping(
 ) -> tuple[Mask, Ints]:
     """Mark segments whose middle half overlaps one of the other's in time, with slack, at most 2 m from it.
 
-    The second array says how much later than that one they are [ns], once ``skew_ns`` is taken off.
+    The second array is their delay after that one [ns], minus ``skew_ns``.
     """
     start_ns, quarter_ns = mine.start_ns - skew_ns, (mine.end_ns - mine.start_ns) // 4
     first = np.searchsorted(other.end_ns, start_ns + quarter_ns - slack_ns, side="right")

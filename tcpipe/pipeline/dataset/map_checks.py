@@ -36,7 +36,7 @@ def register_runs(
 ) -> tuple[tuple[MapRegistration, ...], list[Finding]]:
     """Return the map's registration against each run that crosses enough of it, and findings on misfits.
 
-    Rows of a track count that are certain enough to be sampled. With ``sample.align`` a registration says whether its
+    Rows of a track count that are certain enough to be sampled. With ``sample.align`` a registration states whether its
     shift is applied, and findings why not. `MapError` if the map's heights are in another unit than metres, or scaled.
     """
     projection = find_map_projection(source, recipe.read.gnss_crs)
@@ -108,7 +108,7 @@ def _register(run: StoredRun, source: MapFile, projection: Projection, config: S
 
 
 def _describe_scale(scale: HeightScale, run_id: str, source: MapFile) -> str:
-    """Return the error for a map whose heights are no metres, with the command that corrects its raster."""
+    """Return the error for a map whose heights are not in metres, with the command that corrects its raster."""
     unit, file = scale.find_unit(), source.facts.sources["height"]
     file = "FILE" if "…" in file else shlex.quote(file)
     mended = f"rio edit-info {file} --bidx 1 --units {unit}"
@@ -146,7 +146,7 @@ def _find_shift(found: Registration, run_id: str, name: str, *, is_applied: bool
 
 
 def _find_other_heights(found: Registration, expected_m: float, run_id: str, name: str) -> Findings:
-    """Return the finding, if any, that heights of map and track differ too much."""
+    """Return the finding if heights of map and track differ too much."""
     subject, names = Subject("run", run_id), {"map": name}
     if found.scale.is_off() or found.scale.is_wrong():
         return (make_finding("map-height-scale", subject, names=names, map_rise_m=1 / found.scale.value),)
@@ -193,7 +193,7 @@ def find_contradictions(
     """Return `Quality.MAP_CONTRADICTS_TRACK` or 0 of each patch, shape (N,), and findings on their largest clusters.
 
     Slope, cross slope and heights along the middle of patches are compared run by run; runs without heights and
-    attitude flag nothing.
+    attitude are not flagged.
     """
     motion = np.stack([to_floats(segments, name)[sampled.kept] for name in _MOTION])
     patches, (rear_m, centre_m, front_m) = sampled.patches, sampled.patches.profile_m.T
@@ -251,7 +251,7 @@ def _find_clusters(rows: Ints, excess: _Rows, sampled: Sampled, maps: Sequence[s
 def find_driven_obstacles(
     segments: pa.Table, sources: Sequence[MapFile], recipe: Recipe, *, shifts: Sequence[Shifts]
 ) -> list[Finding]:
-    """Return findings on classes that are not traversable, on which a large part of the segments lies.
+    """Return findings on classes that are not traversable, under a large part of the segments.
 
     Of overlapping ``sources`` the first counts. ``shifts`` are those of the runs, by map.
     """

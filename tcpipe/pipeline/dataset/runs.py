@@ -217,7 +217,7 @@ class Need:
 
 
 def list_needs(runs: Sequence[StoredRun], labels: Sequence[str], *, has_patches: bool) -> list[Need]:
-    """Return what every sample needs: the requested labels, or energy if a run has it; and a position on the map.
+    """Return the columns that every sample needs: requested labels (default: energy if a run has it), and a position.
 
     Without patches a position is needed if any run has one.
     """
@@ -271,7 +271,7 @@ def pool_segments(
 def _describe_nothing_usable(
     runs: Sequence[StoredRun], needs: Sequence[Need], lacks: Mapping[str, Sequence[str]]
 ) -> str:
-    """Return what all runs lack, or what no segment has together, and what to do."""
+    """Return the columns that all runs lack, or that no segment has together, and what to do."""
     everywhere = [need.lack for need in needs if all(need.lack in lack for lack in lacks.values())]
     missing = " and ".join(everywhere or [need.lack for need in needs])
     remedies = ["ingest runs that have it"]
@@ -315,5 +315,5 @@ def move_losses(distance_by_reason_m: Mapping[str, float], lost_m: Mapping[Loss,
         moved[name] = moved.get(name, 0.0) + float(metres)
     total = math.fsum(float(metres) for metres in lost_m.values())
     left = moved.get(KEPT, 0.0) - total
-    moved[KEPT] = left if left > 1e-9 * total else 0.0  # nothing left but rounding
+    moved[KEPT] = left if left > 1e-9 * total else 0.0  # only rounding errors remain
     return moved

@@ -43,7 +43,7 @@ _KEPT_FIELDS = (
     "energy_budget", "labels", "distance_by_reason_m", "repeatability", "flagged_samples", "physics", "added_columns", "shards",
     "checksums",
 )  # fmt: skip
-"""Fields of the card that are published as they are."""
+"""Fields of the card that are published unchanged."""
 
 _KEPT_SECTIONS = ("fuse", "mask", "segment", "label", "sample", "split", "dataset")
 """Sections of the recipe that name no topics, files or robots."""
@@ -98,7 +98,7 @@ class Publication:
         return replace(content, samples=replace(content.samples, added=added.cast(bare), convert=self.convert_samples))
 
     def convert_inputs(self, inputs: ChosenInputs) -> ChosenInputs:
-        """Return inputs whose runs have public names, and nothing of their logs, tags and recipe."""
+        """Return inputs whose runs have public names, and without logs, tags and recipe."""
         runs = tuple(
             RunSource(
                 run_id=self.runs[run.run_id], recipe_id="", robot=self.robots[run.robot], logs=(), sha256="",
