@@ -11,8 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 _URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]+:/{1,2})(\S+)", re.IGNORECASE)
-_CLOSING = ")]}'\",;:."
-"""Characters that may follow a URL in a sentence."""
+_CLOSING = ")]}'\",;:."  # characters that may follow a URL in a sentence
 
 
 def hide_secrets(text: str) -> str:
@@ -51,7 +50,7 @@ def clean_line(text: str) -> str:
 
 
 def list_first(names: Sequence[str], most: int = 1) -> str:
-    """Return the first names, and how many more there are."""
+    """Return the first names, and the number of the others."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"{', '.join(names[:most])}{more}"
 
@@ -121,7 +120,7 @@ class MissingFileError(StoreError):
         self.where = where
 
     def __reduce__(self) -> tuple[type[TcpipeError], tuple[str, ...], dict[str, tuple[Any, ...]]]:
-        """Pickle with the path rather than the line made of it."""
+        """Pickle with the path instead of the complete line."""
         return type(self), (self.where,), {"findings": self.findings}
 
 

@@ -38,8 +38,7 @@ R = TypeVar("R")
 Said: TypeAlias = tuple[Any, ...]
 """Arguments of `Logger.log`."""
 
-_LONGEST_SAYING_BYTES = 3000
-"""Longest message [byte]: a pipe writes it in one piece, even if a process dies."""
+_LONGEST_SAYING_BYTES = 3000  # longest message [byte]: a pipe writes it in one piece, even if a process dies
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +84,7 @@ def run_all(
 
 
 _WORKER = "tcpipe worker"
-_UNGUARDED_EXIT = 78
-"""Exit code of a worker that ran the calls of its script again, EX_CONFIG of sysexits.h."""
+_UNGUARDED_EXIT = 78  # exit code of a worker that ran the calls of its script again, EX_CONFIG of sysexits.h
 _UNGUARDED = (
     "a script that uses several workers needs a main guard, because each worker imports the script: "
     "put its calls below "
@@ -137,7 +135,7 @@ def _run_in_pools(function: Callable[[T], R], todo: Iterator[tuple[int, T]], job
                         suspects.append(ended)
         if suspects:
             logger.warning("a worker process died; the tasks that ran at the same time run again, one by one")
-        for index, task in sorted([*suspects, *running.values()], key=itemgetter(0)):  # one of them killed it
+        for index, task in sorted([*suspects, *running.values()], key=itemgetter(0)):  # one of these tasks killed it
             yield _run_alone(function, task, index)
 
 
@@ -219,13 +217,10 @@ def read_cluster_cpu_s() -> float:
     return _spent["cpu_s"]
 
 
-_ANSWER_S = 10
-"""Longest wait for an answer of a scheduler, and for the first worker of a cluster [s]."""
-_ALONE_S = 300
-"""Longest time for which a cluster may have no workers [s]."""
+_ANSWER_S = 10  # longest wait for an answer of a scheduler, and for the first worker of a cluster [s]
+_ALONE_S = 300  # longest time for which a cluster may have no workers [s]
 _ADDRESS = re.compile(r"(tcp|tls)://[^/@]+:\d+")
-_AHEAD = 2
-"""Tasks that a worker gets at the same time: one runs, the next one waits."""
+_AHEAD = 2  # tasks that a worker gets at the same time: one runs, the next one waits
 
 
 @dataclass(slots=True)
@@ -238,7 +233,7 @@ class _Workers:
     alone_s: float = 0.0
 
     def wait_for_first(self, running: Iterable[Future[R]]) -> set[Future[R]]:
-        """Return the tasks that have ended, when the first has; `TcpipeError` where all workers stay away."""
+        """Return the tasks that have ended, when the first has; `TcpipeError` if all workers stay away."""
         while not (ended := wait(running, timeout=_ANSWER_S, return_when=FIRST_COMPLETED).done):
             self._check_workers()
         return ended

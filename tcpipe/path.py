@@ -17,8 +17,7 @@ import numpy as np
 from tcpipe.arrays import Ints
 from tcpipe.geometry.polyline import Polyline
 
-_LEAST_M = 1e-3
-"""A rest shorter than this is the rounding of coordinates, not a piece [m]."""
+_LEAST_M = 1e-3  # A rest shorter than this is the rounding of coordinates, not a piece [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +92,8 @@ def find_cuts(points: list[list[float]], radius: float) -> list[tuple[float, flo
         side = math.hypot(bx - ax, by - ay)
         ux, uy = (bx - ax) / side, (by - ay) / side
         while True:  # the point at s along this side is `radius` from the last cut
-            along, off = (x0 - ax) * ux + (y0 - ay) * uy, (x0 - ax) * uy - (y0 - ay) * ux
-            s = along + math.sqrt(max(radius * radius - off * off, 0.0))
+            along, offset = (x0 - ax) * ux + (y0 - ay) * uy, (x0 - ax) * uy - (y0 - ay) * ux
+            s = along + math.sqrt(max(radius * radius - offset * offset, 0.0))
             if s > side:
                 break
             x0, y0 = ax + s * ux, ay + s * uy

@@ -28,8 +28,7 @@ from tcpipe.formats.runs import Run, RunFacts, StoredMap, strip_repeated
 from tcpipe.formats.stored_runs import StoredRun, convert_run_errors
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
-_NAME_HEX = 8
-"""Digits of the log's sha256 in the name of a run, more if two logs of one name share them."""
+_NAME_HEX = 8  # digits of the log's sha256 in the name of a run, more if two logs of one name share them
 _MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _MARK_OF_1_X = "store.json"
 

@@ -253,7 +253,7 @@ class World:
         named = {row.blob for row in state.runs.values()} | {row.streams_blob for row in state.runs.values()}
         named |= {each.blob for each in state.maps.values()}
         assert state.blobs == named - {""}
-        assert all(name.startswith("calls/") for name in state.beaten), "replaced documents stay"
+        assert all(name.startswith("calls/") for name in state.replaced), "replaced documents stay"
         assert not verify(self.root).problems
         assert self.see() == seen
 

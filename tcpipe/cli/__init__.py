@@ -206,8 +206,7 @@ _LATEST_S = 4.0
 """Longest time for an orderly end [s]: a library that waits for a network or computes passes no signal to Python."""
 
 
-_RECEIVED = list[int]()
-"""Signals that ask this call to end; an import that one interrupts may fail with another error."""
+_RECEIVED = list[int]()  # signals that ask this call to end; an import that one interrupts may fail with another error
 
 
 class Terminated(BaseException):

@@ -111,7 +111,7 @@ def _read_cells(topic: InspectedTopic) -> list[str]:
     """Return the cells of a topic that was read completely, in the order of `_READ_HEADER`."""
     if (stamps := topic.stamps) is None:
         return [""] * len(_READ_HEADER)
-    odd = {
+    non_numbers = {
         "zero": stamps.zero_stamps,
         "backward": stamps.backward_stamps,
         "wrong": topic.wrong_stamps,
@@ -119,7 +119,7 @@ def _read_cells(topic: InspectedTopic) -> list[str]:
         "duplicates": stamps.duplicates,
     }
     values = [stamps.messages_read, stamps.gaps, stamps.longest_gap_s, topic.time, topic.header_minus_log_s]
-    return [*map(_format_answer, values), ", ".join(f"{count} {kind}" for kind, count in odd.items() if count)]
+    return [*map(_format_answer, values), ", ".join(f"{count} {kind}" for kind, count in non_numbers.items() if count)]
 
 
 def _print_clocks(log: InspectedLog) -> None:

@@ -195,7 +195,7 @@ def layer_values(_: click.Context, __: click.Parameter, values: tuple[str, ...])
 
 
 def class_table_values(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str | None]:
-    """Turn ``NAME`` and ``NAME=FILE`` into a dict, None where there is no file."""
+    """Turn ``NAME`` and ``NAME=FILE`` into a dict, None if there is no file."""
     tables = _parse_named_files("--categorical", values, "expected one class table a layer")
     return {name: table or None for name, table in tables.items()}
 

@@ -180,8 +180,8 @@ class Progress:
         """Show how many logs are done, how fast, and how long the others will take at that."""
         text, took_s = f"{round(bars.tasks[0].completed)}/{len(self._sizes)}", time.monotonic() - self._begun_s
         if self._done and took_s > 0:
-            left = divmod(round(self._waiting / self._done * took_s), 60)
-            text += f", {_format_megabytes(self._done / took_s)} MB/s, {left[0]}:{left[1]:02d} left"
+            remaining = divmod(round(self._waiting / self._done * took_s), 60)
+            text += f", {_format_megabytes(self._done / took_s)} MB/s, {remaining[0]}:{remaining[1]:02d} left"
         bars.update(self._all, said=text + more)
 
 

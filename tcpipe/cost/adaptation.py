@@ -74,26 +74,26 @@ class Adapted:
     total: SumDistribution
 
 
-def predict(errors: QuantityErrors, there: Metres) -> Adapted:
+def predict(errors: QuantityErrors, metres: Metres) -> Adapted:
     """Return the predictions of metres without adaptation."""
-    low, high = errors.compute_intervals(*there.ground)
-    return Adapted(there.predicted, low, high, errors.compute_sum(*there.ground))
+    low, high = errors.compute_intervals(*metres.ground)
+    return Adapted(metres.predicted, low, high, errors.compute_sum(*metres.ground))
 
 
-def adapt(errors: QuantityErrors, known: Metres, there: Metres) -> Adapted:
+def adapt(errors: QuantityErrors, known: Metres, metres: Metres) -> Adapted:
     """Return the predictions of metres, adapted by one or more measured metres of the same run or robot.
 
     Metres without a prediction are NaN and in no sum.
     """
-    has_cost = np.isfinite(there.predicted)
+    has_cost = np.isfinite(metres.predicted)
     if not has_cost.all():
-        part, columns = adapt(errors, known, there.take(has_cost)), np.full((3, has_cost.size), np.nan)
+        part, columns = adapt(errors, known, metres.take(has_cost)), np.full((3, has_cost.size), np.nan)
         columns[:, has_cost] = part.value, part.low, part.high
         return Adapted(columns[0], columns[1], columns[2], part.total)
     whole = float(np.abs(known.predicted).sum())
     usual = whole / float(known.length_m.sum()), whole / float(known.duration_s.sum())
-    spread, spread_there = errors.compute_std(*known.ground), errors.compute_std(*there.ground)
-    design, design_there = _make_design(known, spread, *usual), _make_design(there, spread_there, *usual)
+    spread, spread_there = errors.compute_std(*known.ground), errors.compute_std(*metres.ground)
+    design, design_there = _make_design(known, spread, *usual), _make_design(metres, spread_there, *usual)
     residual, apart_m = known.measured - known.predicted, np.abs(known.distance_m[:, None] - known.distance_m)
     at = int(np.searchsorted(errors.lag_m, 1.0, side="right")) - 1
     neighbour = float(np.clip(errors.correlation[at] - errors.correlation[-1], 0.0, 0.95))  # beyond that of a run
@@ -113,7 +113,7 @@ def adapt(errors: QuantityErrors, known: Metres, there: Metres) -> Adapted:
         evidence = -0.5 * float(np.linalg.slogdet(inner)[1]) - freedom / 2.0 * float(np.log1p(misfit / _FREEDOM))
         scale = (_FREEDOM + misfit) / freedom
         evidences.append(np.log(prior) + evidence)
-        values.append(there.predicted + design_there @ shift)
+        values.append(metres.predicted + design_there @ shift)
         variances.append(scale * (spread_there**2 + ((design_there @ covariance) * design_there).sum(axis=1)))
         totals.append(scale * (of_sum + float(sums @ covariance @ sums)))
     weights = np.exp(np.array(evidences) - max(evidences))

@@ -92,7 +92,7 @@ class Physics:
     terms : term and class of each coefficient (idle, drivetrain, rolling, grade or turning; terrain class or
         `ALL`), J of them.
     value : P0 [W], D [N], F [N], N [N], M [W per rad/s], shape (J,).
-    covariance : of the values, shape (J, J); 0 where a coefficient is bounded at zero.
+    covariance : of the values, shape (J, J); 0 if a coefficient is bounded at zero.
     recovered : k, share of downhill work that comes back; 0 unless steep downhill segments determine it.
     residual_watt : robust standard deviation of the residuals [W], at least 2 % of the power.
     segments : number of fitted segments.
@@ -113,7 +113,7 @@ class Physics:
         return None if terrain == ALL else self.of(term)
 
     def rolling_resistance(self, terrain: str = ALL) -> tuple[float, float] | None:
-        """Return c = F / N of a class with its standard deviation; None where the slopes do not vary."""
+        """Return c = F / N of a class with its standard deviation; None if the slopes do not vary."""
         places = [self.terms.index(key) for key in (("rolling", terrain), ("grade", ALL)) if key in self.terms]
         if len(places) < 2 or self.value[places[1]] <= 0.0:
             return None
@@ -165,8 +165,8 @@ def fit_physics(metres: FitSamples, *, idle_watt: float | None = None) -> Physic
         if not _is_significant(found, term, used) and not (term == "idle" and idle_watt is not None):
             terms = [known for known in terms if known[0] != term]
             found = _fit_robustly(used, terms, idle_watt)
-    off = used.power_watt - found.power_watt(used)
-    spread = estimate_robust_std(off - np.median(off))
+    residual_watt = used.power_watt - found.power_watt(used)
+    spread = estimate_robust_std(residual_watt - np.median(residual_watt))
     return replace(
         found, residual_watt=max(spread, _FINEST * float(np.median(np.abs(used.power_watt)))), segments=rows.size
     )
@@ -324,21 +324,21 @@ def _score_held_out(metres: FitSamples, idle_watt: float | None) -> PhysicsScore
     fold = np.arange(count) * _FOLDS // max(count, 1)
     predicted, true = np.full(count, np.nan), metres.power_watt / metres.velocity_mps
     for number in range(_FOLDS):
-        mine = fold == number
-        found = fit_physics(metres.take(~mine), idle_watt=idle_watt)
-        if found is None or mine.sum() < FEWEST // _FOLDS:
+        is_held_out = fold == number
+        found = fit_physics(metres.take(~is_held_out), idle_watt=idle_watt)
+        if found is None or is_held_out.sum() < FEWEST // _FOLDS:
             return None
-        here = metres.take(mine)
-        predicted[mine] = found.power_watt(here) / here.velocity_mps
+        held_out = metres.take(is_held_out)
+        predicted[is_held_out] = found.power_watt(held_out) / held_out.velocity_mps
     known = np.isfinite(true + predicted)
     return score_energies(true[known], predicted[known])
 
 
 def score_energies(true: Floats, predicted: Floats) -> PhysicsScore:
     """Return how well energies [J/m], shape (M,), are predicted; the mean error is of those that are not about zero."""
-    off = true - predicted
+    error = true - predicted
     spread = float(np.square(true - true.mean()).sum())
-    r2 = 1.0 - float(np.square(off).sum()) / spread if spread > 0.0 else 0.0
+    r2 = 1.0 - float(np.square(error).sum()) / spread if spread > 0.0 else 0.0
     enough = np.abs(true) >= _LEAST_JPM
     counted = enough if enough.any() else true != 0.0
-    return PhysicsScore(r2, float(np.mean(np.abs(off[counted] / true[counted]))) if counted.any() else 0.0)
+    return PhysicsScore(r2, float(np.mean(np.abs(error[counted] / true[counted]))) if counted.any() else 0.0)

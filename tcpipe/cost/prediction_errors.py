@@ -171,9 +171,7 @@ class QuantityErrors:
         if not alone:
             return SumDistribution(middle, 0.0, 0.0)
         size, parts = np.abs(values), [(1.0, self)]
-        if (
-            self.near is not None and is_near is not None
-        ):  # correlations are those of the ground that most of the path is on
+        if self.near is not None and is_near is not None:  # correlations of the ground under most of the path
             share = float(is_near[known].mean())
             parts = [(1.0 - share, self), (share, self.near)]
         below = above = 0.0
@@ -315,7 +313,7 @@ _COMMON = {"duration": "duration_common_std_s", "energy": "energy_common_std_jou
 
 
 def _find_common_share(residuals: Residuals, name: str) -> float:
-    """Return the standard deviation of the labels' common error as a share of their sum; 0 where it is not stated."""
+    """Return the standard deviation of the labels' common error as a share of their sum; 0 if it is not stated."""
     if not {_COMMON.get(name, name), "duration_s"} <= residuals.keys():
         return 0.0
     std, label = residuals[_COMMON[name]].astype(float), residuals["duration_s"].astype(float)
@@ -338,7 +336,7 @@ class _Held:
     """Fold that was held out with it."""
     is_one_fold: bool
     stated: Mapping[str, Floats]
-    """Standard deviations by the model; 0 where it states none."""
+    """Standard deviations by the model; 0 if it states none."""
     has_power: bool
     """Whether power is known; else it is 0."""
 

@@ -19,13 +19,13 @@ _FEWEST_FITTED = 12  # fewest samples of a class for a parabola over slope; else
 
 def compute_slope_residuals(values: Floats, terrain_class: AnyInts, slope_rad: Floats) -> Floats:
     """Return the residuals of a label from a parabola over slope for each class, shape (N,)."""
-    left = np.empty(len(values))
+    residual = np.empty(len(values))
     for kind in np.unique(terrain_class):
         rows = np.flatnonzero(terrain_class == kind)
         powers = 3 if len(rows) >= _FEWEST_FITTED else 1
         design = np.vander(slope_rad[rows], powers, increasing=True)
-        left[rows] = values[rows] - design @ np.linalg.lstsq(design, values[rows])[0]
-    return left
+        residual[rows] = values[rows] - design @ np.linalg.lstsq(design, values[rows])[0]
+    return residual
 
 
 NEAR = 0.25

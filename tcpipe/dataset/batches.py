@@ -24,11 +24,9 @@ IN_MEMORY_BYTES = 2 << 30
 CACHED_PIECES = 64
 """Pieces kept for reading at random from a split that is not in memory."""
 
-_FLIPPED = ("cross_slope_rad",)
-"""Columns whose sign changes when a sample is mirrored across its direction of travel."""
+_FLIPPED = ("cross_slope_rad",)  # columns whose sign changes when a sample is mirrored across its direction of travel
 
-_POOL_PIECES = 16
-"""Number of pieces that are shuffled together: 4096 samples of a Zarr dataset, 26 MB."""
+_POOL_PIECES = 16  # number of pieces that are shuffled together: 4096 samples of a Zarr dataset, 26 MB
 
 
 class StoredPixels:
@@ -113,7 +111,7 @@ class StoredPixels:
             self._pieces.move_to_end(key)
             return self._pieces[key]
         pixels = self.files.read(piece, layers)
-        if not self.fit(layers):  # else every piece is read once and never again
+        if not self.fit(layers):  # else every piece is read only once
             self._pieces[key] = pixels
             if len(self._pieces) > CACHED_PIECES:
                 self._pieces.popitem(last=False)

@@ -35,7 +35,7 @@ def name_common_std(column: str) -> str:
 
 
 def find_energy(name: str) -> Energy:
-    """Return an energy by its name; `DatasetError` lists those there are."""
+    """Return an energy by its name; `DatasetError` lists the known ones."""
     if name not in ENERGIES:
         raise DatasetError(f"label {name!r}: expected one of {', '.join(ENERGIES)}")
     return ENERGIES[name]

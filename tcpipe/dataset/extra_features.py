@@ -29,13 +29,13 @@ class ExtraFeatures:
     """Commanded speed; NaN if unknown."""
 
     def take(self, rows: Ints | Mask | slice) -> ExtraFeatures:
-        """Return some of them."""
+        """Return the features of some rows."""
         return ExtraFeatures(*(getattr(self, entry.name)[rows] for entry in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
 class ExtraFeature:
-    """A number that a model takes beside a patch, with its distribution over the training samples."""
+    """An input of a model in addition to the patch, with its distribution over the training samples."""
 
     name: Literal["turn_radpm", "command_mps"]
     mean: float

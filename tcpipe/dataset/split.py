@@ -43,11 +43,9 @@ if TYPE_CHECKING:
     from tcpipe.dataset.torch_data import TorchBatches
 
 
-_MIN_STD = 0.1
-"""Standard deviations are taken as at least this share of their median, so that no sample outweighs a hundred."""
+_MIN_STD = 0.1  # least standard deviation, as a share of their median [1]: bounds the weight of a sample
 
-_NAMED = 5
-"""Most unknown ids in one message."""
+_NAMED = 5  # most unknown ids in one message
 
 
 @dataclass(slots=True)
@@ -61,9 +59,11 @@ class SampleColumns:
     def __getitem__(self, name: str) -> GenericArray:
         """Return one column, nulls as NaN or None, shape (N,)."""
         if name not in self._read:
-            there = sample_columns(self.directory)
-            if name not in there:
-                raise DatasetError(f"{self.directory}: its samples have no column {name!r}; it has {', '.join(there)}")
+            known_columns = sample_columns(self.directory)
+            if name not in known_columns:
+                raise DatasetError(
+                    f"{self.directory}: its samples have no column {name!r}; it has {', '.join(known_columns)}"
+                )
             self._read[name] = read_samples(self.directory, [name]).column(name).take(self.rows).to_numpy()
         return self._read[name]
 
@@ -78,7 +78,7 @@ class Split:
 
     Attributes
     ----------
-    name : ``train``, ``test``, ``unseen`` or ``buffer``; ``selection`` of a selection from all of them.
+    name : ``train``, ``test``, ``unseen`` or ``buffer``; ``selection`` for a selection of several.
     view : its samples among the stored pixels.
     energy : which of the two energies its labels are of.
     has_energy : whether any sample of the dataset has that energy.
@@ -322,7 +322,7 @@ class Split:
 
 
 def _compute_inverse_variance_weights(std: Floats) -> Floats:
-    """Return weights with a mean of 1 from standard deviations, shape (N,); 0 where one is not finite."""
+    """Return weights with a mean of 1 from standard deviations, shape (N,); 0 if one is not finite."""
     known = np.isfinite(std)
     if not known.any():
         return np.zeros(std.shape)
@@ -416,8 +416,8 @@ def open_dataset(path: Location, *, layers: Sequence[str] | None = None, label: 
             f"{cause if card.labels.get('energy') else 'the runs have no power'}"
         )
     files = open_patches(directory, card, fetched)
-    asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
-    form = make_tensor_layout(asked, files.layers, files.patch_px) if files.layers else TensorLayout((), {}, 0)
+    requested = [name for name in LAYERS if name in files.layers] if layers is None else layers
+    form = make_tensor_layout(requested, files.layers, files.patch_px) if files.layers else TensorLayout((), {}, 0)
     places = find_places_in_files(card, split)
 
     def make_split(name: str, rows: Ints) -> Split:

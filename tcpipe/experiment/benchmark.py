@@ -37,10 +37,8 @@ JSON, PAGE = "benchmark.json", "benchmark.html"
 
 KINDS: tuple[ModelKind, ...] = ("linear", "physics", "boosting", "resnet18")
 
-_FEWEST_RUNS = 5
-"""Runs below which an error has no interval [1]."""
-_UPPER = 0.975
-"""Quantile of Student's t at the upper end of a 95 % interval [1]."""
+_FEWEST_RUNS = 5  # runs below which an error has no interval [1]
+_UPPER = 0.975  # quantile of Student's t at the upper end of a 95 % interval [1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,19 +123,21 @@ def run_benchmark(
         for kind in (*kinds, *own_kind):
             own = predictor if kind == "own" else None
             is_random = kind == "own" or find_kind(kind).stops_by_fold
-            count, made, tables, times_s = seeds if is_random else 1, list[Evaluation](), list[pa.Table](), []
+            count, repeated, tables, times_s = seeds if is_random else 1, list[Evaluation](), list[pa.Table](), []
             for seed in range(count):
-                here = place / name / f"{kind}-{seed}"
+                folder = place / name / f"{kind}-{seed}"
                 logger.info("%s: %s, training %d of %d", name, kind, seed + 1, count)
-                rules = replace(config or FitConfig(), model=kind, seed=seed)
-                times_s.append(_train(dataset, here, rules, own))
-                rules_here = replace(evaluating or EvaluateConfig(noise_draws=1), seed=seed)
-                done = run_evaluation(here / "model", dataset, here / "evaluation", config=rules_here, predictor=own)
-                made.append(done.values)
-                tables.append(read_table(here / "evaluation" / SAMPLES))
-            evaluations[name, kind] = made
+                fit_config = replace(config or FitConfig(), model=kind, seed=seed)
+                times_s.append(_train(dataset, folder, fit_config, own))
+                evaluate_config = replace(evaluating or EvaluateConfig(noise_draws=1), seed=seed)
+                evaluation = run_evaluation(
+                    folder / "model", dataset, folder / "evaluation", config=evaluate_config, predictor=own
+                )
+                repeated.append(evaluation.values)
+                tables.append(read_table(folder / "evaluation" / SAMPLES))
+            evaluations[name, kind] = repeated
             runs = np.array([run_of[sample] for sample in to_texts(tables[0].column("sample_id"))], np.str_)
-            rows += _summarize(name, kind, made, tables, runs, float(np.mean(times_s)))
+            rows += _summarize(name, kind, repeated, tables, runs, float(np.mean(times_s)))
     values = Benchmark(rows=tuple(rows))
     write_json(place / JSON, values)
     sections = [PageSection(title, header=header, rows=table) for title, header, table in list_tables(values.rows)]
@@ -183,15 +183,15 @@ def _summarize(  # noqa: PLR0917
                 )  # fmt: skip
 
 
-def estimate_rmse(off: Floats, runs: Texts) -> Ratio:
+def estimate_rmse(errors: Floats, runs: Texts) -> Ratio:
     """Return the root mean square of errors, shape (trainings, N), with its 95 % interval.
 
     The variance of the mean square is that between runs, whose samples correlate, and that between trainings over their
     number.
     """
-    if not off.size:
+    if not errors.size:
         return Ratio(None, None, None)
-    squares, count = np.square(off), off.shape[1]
+    squares, count = np.square(errors), errors.shape[1]
     value = float(np.sqrt(squares.mean()))
     _, at = np.unique(runs, return_inverse=True)
     groups = int(at.max()) + 1
@@ -199,8 +199,8 @@ def estimate_rmse(off: Floats, runs: Texts) -> Ratio:
         return Ratio(value, None, None)
     sums = np.bincount(at, squares.mean(axis=0) - squares.mean())
     variance = groups / (groups - 1.0) * float(np.square(sums).sum()) / count**2
-    if len(off) > 1:
-        variance += float(squares.mean(axis=1).var(ddof=1)) / len(off)
+    if len(errors) > 1:
+        variance += float(squares.mean(axis=1).var(ddof=1)) / len(errors)
     half = float(stdtrit(groups - 1, _UPPER) * np.sqrt(variance)) / (2.0 * value)
     return Ratio(value, max(value - half, 0.0), value + half)
 
@@ -208,11 +208,11 @@ def estimate_rmse(off: Floats, runs: Texts) -> Ratio:
 def list_tables(rows: Sequence[BenchmarkRow]) -> Iterator[tuple[str, Sequence[str], list[Sequence[str]]]]:
     """Yield a title, a header and the lines of a table for each dataset and split."""
     for name, split in dict.fromkeys((row.dataset, row.split) for row in rows):
-        here = [row for row in rows if (row.dataset, row.split) == (name, split)]
-        classes = [terrain for terrain in dict.fromkeys(row.terrain for row in here) if terrain != ALL]
-        found = {(row.quantity, row.kind, row.terrain): row for row in here}
+        selected = [row for row in rows if (row.dataset, row.split) == (name, split)]
+        classes = [terrain for terrain in dict.fromkeys(row.terrain for row in selected) if terrain != ALL]
+        found = {(row.quantity, row.kind, row.terrain): row for row in selected}
         lines: list[Sequence[str]] = []
-        for quantity, kind in dict.fromkeys((row.quantity, row.kind) for row in here):
+        for quantity, kind in dict.fromkeys((row.quantity, row.kind) for row in selected):
             whole = found[quantity, kind, ALL]
             cells = [_format_cell(found.get((quantity, kind, terrain))) for terrain in (*classes, ALL)]
             more = (

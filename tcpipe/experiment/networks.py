@@ -65,16 +65,16 @@ class NetworkResults:
 
 def compare_networks(model: Path, dataset: Path, place: Path, *, seed: int) -> tuple[BaselineResult, ...]:
     """Train the networks beside a model below ``place``, and return their errors of E; a second call reads them."""
-    ours, where = load_model(model), place / "networks.json"
-    if where.is_file() and (known := read_as(where, NetworkResults)).model == ours.checksum:
+    own_model, where = load_model(model), place / "networks.json"
+    if where.is_file() and (known := read_as(where, NetworkResults)).model == own_model.checksum:
         return known.results
     place.mkdir(parents=True, exist_ok=True)
-    data, fitted = open_dataset(dataset, label=ours.card.label_energy), ours.card.training.samples["fitted"]
-    train = make_training_samples(data, ours.card.training.config, NetworkModel)
-    heights = make_training_samples(data, replace(ours.card.training.config, layers=("height",)), NetworkModel)
+    data, fitted = open_dataset(dataset, label=own_model.card.label_energy), own_model.card.training.samples["fitted"]
+    train = make_training_samples(data, own_model.card.training.config, NetworkModel)
+    heights = make_training_samples(data, replace(own_model.card.training.config, layers=("height",)), NetworkModel)
     energy = replace(heights.inputs, outputs=(heights.split.energy.energy,))
     of_energy = EnergySamples(heights.split, energy, heights.config, heights.idle_watt)
-    names = {entry.id: entry.name for entry in ours.card.class_table.classes}
+    names = {entry.id: entry.name for entry in own_model.card.class_table.classes}
     by_class = {
         ALL_LAYERS: _fit_by_class(NetworkModel, train, place / "class", fitted),
         HEIGHTS: _fit_by_class(EnergyNetwork, of_energy, place / "height", fitted),
@@ -87,18 +87,18 @@ def compare_networks(model: Path, dataset: Path, place: Path, *, seed: int) -> t
         same = collect_measured(whole.split.take(np.isin(whole.class_ids, known_classes)), names)
         if not len(same.split):
             continue
-        said = predict_costs(ours, same.split)
+        predicted = predict_costs(own_model, same.split)
         for name, networks in by_class.items():
             joule, block_m = np.empty(len(same.split)), data.card.recipe.split.block_m
             for number, (samples, trained) in networks.items():
                 here = np.flatnonzero((same.class_ids == number) | (name == GRASS))
                 if here.size:
                     ground = same.split.take(here), same.class_ids[here]
-                    joule[here] = _predict_energy(samples, trained, *ground, ours.card.chord_m)
+                    joule[here] = _predict_energy(samples, trained, *ground, own_model.card.chord_m)
             if networks:
                 theirs = Predicted({"E": joule}, {})
-                results += compare_with_baseline(name, split, same, said, theirs, block_m=block_m, seed=seed)
-    write_json(where, NetworkResults(model=ours.checksum, results=tuple(results)))
+                results += compare_with_baseline(name, split, same, predicted, theirs, block_m=block_m, seed=seed)
+    write_json(where, NetworkResults(model=own_model.checksum, results=tuple(results)))
     return tuple(results)
 
 
@@ -127,15 +127,17 @@ def _predict_energy(samples: Samples, fitted: Fitted, split: Split, class_id: In
     """Return centred energies [J]; of a network of energy alone as of a power at 1 m/s."""
     there = replace(samples, split=split.with_channels(*samples.inputs.channels))
     is_held, alone = find_held_out(fitted.held_out), len(samples.inputs.outputs) == 1
-    labels, held, said = (
+    labels, held, prediction = (
         samples.labels[is_held],
         fitted.held_out.mean[is_held],
         predict_samples(fitted.predictor, there),
     )
     if alone:
-        labels, held, mean = (np.column_stack([values, np.ones(len(values))]) for values in (labels, held, said.mean))
-        said, chord_m = Prediction.without_covariance(mean), 1.0
+        labels, held, mean = (
+            np.column_stack([values, np.ones(len(values))]) for values in (labels, held, prediction.mean)
+        )
+        prediction, chord_m = Prediction.without_covariance(mean), 1.0
     rows = samples.split.take(is_held)
     columns = {name: rows.column(name) for name in ("run_id", "start_ns", "terrain_class", "fold")}
     residuals = columns | make_residuals(labels, held, np.zeros((len(labels), 2, 2)))
-    return Predicted.centre(residuals, said, class_id, chord_m).costs["E"]
+    return Predicted.centre(residuals, prediction, class_id, chord_m).costs["E"]

@@ -1,4 +1,4 @@
-"""Outputs appear whole or not at all: written under a temporary name beside their place, synced, then renamed.
+"""Write outputs atomically: under a temporary name in the same directory, synced, then renamed.
 
 A temporary is in a *holder* beside its place, ``.tmp-<name of the place>-<8 hex>``, which its writer locks. An unlocked
 holder is that of a killed process. Each writer into a directory first clears it (`clear`): an output that was moved
@@ -32,8 +32,7 @@ TEMPORARY_PREFIX = ".tmp-"
 """Prefix of the names of temporaries; readers skip them."""
 
 _HOLDER = re.compile(re.escape(TEMPORARY_PREFIX) + r"(.+)-[0-9a-f]{8}", re.DOTALL)
-_LONGEST_NAME = 200
-"""Bytes of a place's name in that of its holder."""
+_LONGEST_NAME = 200  # bytes of a place's name in that of its holder
 
 _BEFORE = ".before"
 """Name in a holder of the earlier directory, if the system cannot exchange two directories in one step."""
@@ -41,8 +40,7 @@ _BEFORE = ".before"
 _UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}
 """Errors that only writing can cause, for any file name."""
 
-_LAST_WRITE_S = 0.05
-"""Where writing is broken off by a signal, a thread of zarr still finishes the small file it is at."""
+_LAST_WRITE_S = 0.05  # where writing is broken off by a signal, a thread of zarr still finishes the small file it is at
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -122,8 +120,8 @@ def make_scratch_directory() -> Iterator[Path]:
 
 def clear_scratch() -> None:
     """Remove scratch directories of killed processes."""
-    for left in Path(tempfile.gettempdir()).glob(f"{_make_scratch_prefix()}*"):
-        _remove_if_abandoned(left, lambda left=left: shutil.rmtree(left))  # type: ignore[misc]
+    for leftover in Path(tempfile.gettempdir()).glob(f"{_make_scratch_prefix()}*"):
+        _remove_if_abandoned(leftover, lambda leftover=leftover: shutil.rmtree(leftover))  # type: ignore[misc]
 
 
 def _make_scratch_prefix() -> str:
@@ -203,7 +201,7 @@ def _is_of_writing(error: OSError, place: Path) -> bool:
 
 @contextmanager
 def _make_parents(path: Path) -> Iterator[Path]:
-    """Make the directories above ``path`` and yield its real place; those that were made go again on failure."""
+    """Make the parent directories of ``path``, and yield its real path; new directories are removed on failure."""
     place = Path(os.path.realpath(check_local_output(path)))
     missing = [parent for parent in place.parents if not parent.exists()]
     in_the_way = next((parent for parent in place.parents if parent.exists() and not parent.is_dir()), None)
@@ -233,7 +231,7 @@ def _make_locked_holder(place: Path) -> Iterator[Path]:
     finally:
         try:
             shutil.rmtree(holder, ignore_errors=True)
-        finally:  # also where a signal came in the midst of it
+        finally:  # also after a signal
             shutil.rmtree(holder, ignore_errors=True)
             os.close(lock)
 
@@ -250,7 +248,7 @@ def _make_locked_directory(parent: Path, prefix: str, mode: int = 0o777) -> tupl
                 if holder.exists():
                     return holder, lock
                 os.close(lock)
-        except BaseException:  # a signal comes here, too
+        except BaseException:  # also for signals
             shutil.rmtree(holder, ignore_errors=True)
             raise
 
@@ -370,7 +368,7 @@ def check_local_output(path: Location) -> Path:
 
 
 def check_output(path: Location, wanted: str = "directory") -> Path:
-    """Return where a directory or a file is written; `UsageError` if the other of them, or a URL, is in the way."""
+    """Return the output path of a directory or file; `UsageError` if another kind of file, or a URL, is there."""
     place = check_local_output(path)
     if _find_kind(place) not in (None, wanted):
         problem = (
@@ -386,7 +384,7 @@ def check_output(path: Location, wanted: str = "directory") -> Path:
 
 
 def check_input(path: Location, wanted: str = "file or directory") -> Path:
-    """Return a file or directory that is there; `UsageError` else, or where it is not as wanted."""
+    """Return the path of an existing file or directory; `UsageError` if it is missing or of another kind."""
     kind = _find_kind(Path(path))
     if kind is None:
         why = "; it is read from this machine only" if _LIKE_A_URL.match(str(path)) else ""

@@ -20,8 +20,7 @@ _SHARE_UNSEEN = 64
 """Fraction of the limit that a process may exceed before it scans the whole cache again, which takes time [1]."""
 _unseen_bytes = [float("inf")]
 """Bytes that this process has added since it last listed the cache; infinite before the first list."""
-_IN_USE_S = 60.0
-"""A file that was used within this time stays: another process may be about to open it."""
+_IN_USE_S = 60.0  # A file that was used within this time stays: another process may be about to open it
 
 
 def fetch_cached(key: str, fetch: Callable[[Path], object]) -> Path:
@@ -89,8 +88,8 @@ def _make_room(directory: Path, most: int, *, now: float) -> None:
     files = []
     for path in directory.glob("??/*"):
         with suppress(OSError):
-            seen = path.stat()
-            files.append((seen.st_mtime, seen.st_size, path))
+            status = path.stat()
+            files.append((status.st_mtime, status.st_size, path))
     total = sum(size for _, size, _ in files)
     for used, size, path in sorted(files):
         if total <= most or now - used < _IN_USE_S:

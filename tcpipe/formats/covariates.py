@@ -45,7 +45,7 @@ class CovariateTable:
         """Return the last row at or before each stamp that is not older than the limit; and which stamps a row reaches.
 
         ``stamp_ns`` (UTC, shape (N,)) may be in any order; columns are called as the file, without its ending, and the
-        column. They are null where no row reaches, or it has no value.
+        column. They are null if no row is near enough, or its value is missing.
         """
         wanted = pl.DataFrame({_STAMP: stamp_ns}).with_row_index(_ROW).sort(_STAMP)
         there = self.rows.with_columns(pl.col(_STAMP).alias(_FOUND))
@@ -126,10 +126,10 @@ _COLUMN = format_recipe_key("covariates.time_column")
 
 
 def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
-    there = ", ".join(table.columns)
+    columns = ", ".join(table.columns)
     if wanted is not None:
         if wanted not in table.columns:
-            raise DatasetError(f"{path}: no column {wanted!r} ({_COLUMN}); there are {there}")
+            raise DatasetError(f"{path}: no column {wanted!r} ({_COLUMN}); there are {columns}")
         return wanted
     endings = ("", *(f"_{unit}" for unit in STAMP_UNITS))
     found = [
@@ -138,12 +138,12 @@ def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
         if name.lower() in {f"{time_name}{end}" for time_name in _TIME_NAMES for end in endings}
     ]
     if len(found) != 1:
-        said = (
+        problem = (
             f"{len(found)} columns tell the time ({', '.join(found)})"
             if found
             else "no column is called as one of time"
         )
-        raise DatasetError(f"{path}: {said}; name it ({_COLUMN}); there are {there}")
+        raise DatasetError(f"{path}: {problem}; name it ({_COLUMN}); there are {columns}")
     return found[0]
 
 
@@ -173,13 +173,13 @@ def _parse_values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], lis
             made.append(values.set(~values.is_finite(), None))
             continue
         text = column.cast(pl.String)
-        odd = text.filter(text.cast(pl.Float64, strict=False).is_null() & text.is_not_null())
-        if 0 < len(odd) < _MOSTLY * text.count():
+        invalid = text.filter(text.cast(pl.Float64, strict=False).is_null() & text.is_not_null())
+        if 0 < len(invalid) < _MOSTLY * text.count():
             finding = make_finding(
                 "column-is-text",
                 Subject("column", f"{path.stem}_{column.name}"),
-                names={"file": path.name, "example": str(odd[0])},
-                odd_count=len(odd),
+                names={"file": path.name, "example": str(invalid[0])},
+                odd_count=len(invalid),
                 value_count=text.count(),
             )
             findings.append(finding)

@@ -311,7 +311,7 @@ class DatasetCard:
     distance_by_reason_m: Mapping[str, float]
     """Distance breakdown of the runs [m]."""
     repeatability: Mapping[str, Floor | None]
-    """How well each label repeats itself; None where no place was driven twice."""
+    """How well each label repeats itself; None if no place was driven twice."""
     runs: tuple[RunSource, ...]
     maps: tuple[MapSource, ...]
     flagged_samples: FlaggedSamples

@@ -48,11 +48,9 @@ RECORDS: Mapping[Kind, type[Record]] = {
 }  # fmt: skip
 _NAME = re.compile(r"([0-9a-f]{16})\.([0-9]{1,9})\.([0-9a-f]{16})\.json")
 _UNREAD = 16
-_UNREAD_SHARE = 50
-"""The index is written again when more than 16 documents, and one for each 50 in it, were not in it."""
+_UNREAD_SHARE = 50  # the index is rewritten if it lacks more than 16 documents, plus one for each 50 in it
 
-_SEAL = b"sha256"
-"""Key of the metadata of the index."""
+_SEAL = b"sha256"  # key of the metadata of the index
 
 T = TypeVar("T")
 
@@ -95,7 +93,7 @@ class State:
     """Names of the documents that count."""
     highest: dict[tuple[Kind, str], int] = field(default_factory=dict)
     """The highest number of each kind and key, also of damaged documents."""
-    beaten: list[str] = field(default_factory=list)
+    replaced: list[str] = field(default_factory=list)
     """Names of the documents that do not count."""
     damaged: list[str] = field(default_factory=list)
     """Names of documents that are not as they were written."""
@@ -201,7 +199,7 @@ class State:
     def add(self, name: Name, record: Record) -> None:
         """Add a document that was written after the scan."""
         key = name.kind, name.key
-        self.beaten += [self.names[key]] if key in self.names else []
+        self.replaced += [self.names[key]] if key in self.names else []
         self.highest[key] = max(name.number, self.highest.get(key, 0))
         self.facts[name.kind][name.key], self.names[key] = record, str(name)
         self.is_new = False
@@ -243,30 +241,31 @@ def scan(place: Place) -> State:
 
 
 def _scan(place: Place, decoded: dict[str, Record]) -> State:
-    state, turn = State(), dict[tuple[Kind, str], list[Name]]()
+    """Return the state of a place from its documents; documents that it reads are added to ``decoded``."""
+    state, candidates = State(), dict[tuple[Kind, str], list[Name]]()
     for kind in KINDS:
         for file in place.list(kind):
             if (name := parse_name(kind, file)) is not None:
-                turn.setdefault((kind, name.key), []).append(name)
-    state.blobs, state.is_new = frozenset(place.list(BLOBS)), not turn
-    for key, names in turn.items():
+                candidates.setdefault((kind, name.key), []).append(name)
+    state.blobs, state.is_new = frozenset(place.list(BLOBS)), not candidates
+    for key, names in candidates.items():
         names.sort(key=lambda name: (-name.number, name.digest))
         state.highest[key] = names[0].number
-    unread = sum(str(names[0]) not in decoded for names in turn.values())
+    unread = sum(str(names[0]) not in decoded for names in candidates.values())
     indexed = _read_index(place) if unread > _UNREAD else dict[str, bytes]()
     fresh = dict[str, bytes]()
-    while turn:  # once, and again where the document that should count is damaged
-        fresh |= _decode(place, [names[0] for names in turn.values()], indexed, decoded)
+    while candidates:  # repeated with older documents if the newest one is damaged
+        fresh |= _decode(place, [names[0] for names in candidates.values()], indexed, decoded)
         damaged = dict[tuple[Kind, str], list[Name]]()
-        for key, (name, *others) in turn.items():
+        for key, (name, *others) in candidates.items():
             if str(name) in decoded:
                 state.facts[name.kind][name.key], state.names[key] = decoded[str(name)], str(name)
-                state.beaten += map(str, others)
+                state.replaced += map(str, others)
             else:
-                is_there = place.size(str(name)) is not None  # else a prune has removed it since it was listed
+                is_there = place.size(str(name)) is not None  # else removed by a prune after it was listed
                 state.damaged += [str(name)] if is_there else []
                 damaged |= {key: others} if others else {}
-        turn = damaged
+        candidates = damaged
     state.read = len(fresh)
     if len(fresh) > _UNREAD + len(indexed) // _UNREAD_SHARE:
         names_that_count = state.names.values()
@@ -301,7 +300,7 @@ def _decode(
 
 
 def _read_document(place: Place, name: Name) -> bytes | None:
-    """Return the bytes of a document; None where they are not as they were written."""
+    """Return the bytes of a document; None if they have changed."""
     try:
         data = place.read(str(name))
     except StoreError as error:

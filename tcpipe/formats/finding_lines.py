@@ -45,13 +45,11 @@ _DAMAGE: Mapping[str, str] = {
     "places_count": "{} places", "first_offset": "at byte {}", "lost_messages_count": "{} messages lost", "lost_bytes": "{} lost"
 }  # fmt: skip
 """Numbers that follow a line in brackets, where they are more than zero and the template lacks them."""
-_EVIDENCE = ("field", "wanted", "joints", "platforms")
-"""Names that are appended, if the template lacks them."""
+_EVIDENCE = ("field", "wanted", "joints", "platforms")  # names that are appended, if the template lacks them
 _MOST_SUBJECTS = 3
 _DIGITS = 3
 _LARGEST_PLAIN = 1e6
-_SHORT_S = 2.0
-"""Shorter spans are written with tenths of a second."""
+_SHORT_S = 2.0  # shorter spans are written with tenths of a second
 
 
 def format_number(name: str, value: float) -> str:

@@ -33,8 +33,7 @@ MAX_VALUES = 1_500_000
 
 _SIMPLER = "; simplify it: ogr2ogr -simplify 0.000001 out.geojson in.geojson"
 _SHOWN_CHARACTERS = 200
-_SHOWN = 5
-"""Problems of one kind that an error lists."""
+_SHOWN = 5  # problems of one kind that an error lists
 
 
 def read_regions(path: Path) -> Regions:
@@ -238,8 +237,7 @@ def _find_disagreements(path: Path, polygons: Mapping[str, list[BaseGeometry]]) 
 
 P = TypeVar("P")
 
-_DECIMALS = 9
-"""A tenth of a millimetre."""
+_DECIMALS = 9  # A tenth of a millimetre
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,7 @@ T = TypeVar("T")
 Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]
 """A value in a format of another standard (JSON-LD, CF attributes); documents of tcpipe are dataclasses."""
 
-_CONVERTING = Lock()
-"""Lock: msgspec (0.22) crashes if two threads use a new dataclass at the same time."""
+_CONVERTING = Lock()  # lock: msgspec (0.22) crashes if two threads use a new dataclass at the same time
 
 MOST_BYTES = 32 << 20
 """A document is at most so large [byte], written and read: the card of ten thousand runs."""
@@ -72,7 +71,7 @@ def to_json_line(value: Any) -> str:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as canonical JSON, whole or not at all; `StoreError` where it is too large to be read again."""
+    """Write ``value`` as canonical JSON, whole or not at all; `StoreError` if it is too large to be read again."""
     text = to_json(value)
     if len(text) > MOST_BYTES // 4 and len(text.encode()) > MOST_BYTES:
         raise StoreError(f"{path}: would be more than {MOST_BYTES >> 20} MB, the most that tcpipe reads")

@@ -33,8 +33,7 @@ U = TypeVar("U")
 _SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY", "TCPIPE_RETRY_MINUTES")
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[0-9a-f:]+\])(:\d{1,5})?(/[\w./-]*)?", re.IGNORECASE)
-_PIECE_BYTES = 1 << 24
-"""Size of a request for a part of a large file [byte]."""
+_PIECE_BYTES = 1 << 24  # size of a request for a part of a large file [byte]
 _AT_ONCE = 8
 _PERCENT_ENCODED = ("file", "http", "https")
 """Schemes with percent-encoded names; URLs of object stores are not encoded."""
@@ -42,8 +41,7 @@ _FIRST_S, _FIRST_RETRY_S = 4.0, 1.0
 """The first request of a process waits so long for an answer, and is repeated for so long: a user may be watching."""
 _RETRY_MINUTES = "10"
 """Time for which obstore repeats later requests [min], unless TCPIPE_RETRY_MINUTES is set: a store may restart."""
-_MAX_RETRIES = 10_000
-"""More than fit into that time: the time alone decides."""
+_MAX_RETRIES = 10_000  # more than fit into that time: the time alone decides
 _DENIED = (
     "169.254.169.254", "Account must be specified", "401 Unauthorized", "403 Forbidden", "Missing AccessKeyId", "Missing SecretAccessKey"
 )  # fmt: skip
@@ -319,10 +317,10 @@ def _describe_no_answer(error: Exception) -> str:
     """Return the address that does not answer, the error, and what to check."""
     text = str(error)
     address, status = _ADDRESS.search(text), _STATUS.search(text)
-    answer = next((words for pattern, words in _NO_ANSWER.items() if pattern in text), "the connection broke")
-    answer = f"it answers {status[0]}" if status else answer
+    problem = next((words for pattern, words in _NO_ANSWER.items() if pattern in text), "the connection broke")
+    problem = f"it answers {status[0]}" if status else problem
     where = hide_secrets(address[0]) if address else "the store"
-    return f"no answer from {where}: {answer}; check that it runs and that the address is right"
+    return f"no answer from {where}: {problem}; check that it runs and that the address is right"
 
 
 def split_bucket(url: str) -> tuple[str, str]:

@@ -35,8 +35,7 @@ ROWS_PER_GROUP = 1 << 17
 """Rows of a group, which is decoded as a whole."""
 MOST_BYTES, MOST_TIMES = 256_000_000, 100
 """Largest table in memory [byte], and in multiples of its file: ours shrink to a tenth, except constant columns."""
-_MOST_DEPTH = 4
-"""Structs in one another in the header of a page."""
+_MOST_DEPTH = 4  # structs in one another in the header of a page
 _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}
 """Bytes of a value, by physical type."""
 EMPTY_MEMBER = "structure_needs_at_least_one_member"
@@ -96,7 +95,7 @@ def _add_struct_member(dtype: pa.DataType) -> pa.DataType:
 
 @contextmanager
 def _convert_damage(where: Location) -> Iterator[None]:
-    """Raise `StoreError` where the file cannot be read."""
+    """Raise `StoreError` if the file cannot be read."""
     try:
         yield
     except (OSError, pa.ArrowException, ValueError, IndexError) as error:

@@ -39,8 +39,7 @@ T = TypeVar("T")
 U = TypeVar("U")
 _List: TypeAlias = list  # the type: `Place` has a method of that name
 
-_MAX_BYTES = 256 << 20
-"""Largest file that is read as a whole [byte]."""
+_MAX_BYTES = 256 << 20  # largest file that is read as a whole [byte]
 
 
 REPORT = "report.html"
@@ -97,7 +96,7 @@ class Place:
         return run_side_by_side(function, items) if self.path is None else list(map(function, items))
 
     def read(self, name: str) -> bytes | None:
-        """Return a whole file; None if it does not exist. On disk, `StoreError` if it exceeds any document or page."""
+        """Return a whole file; None if it does not exist. `StoreError` if a file on disk is too large for tcpipe."""
 
         def read(path: Path) -> bytes:
             if path.stat().st_size <= _MAX_BYTES:
@@ -131,8 +130,8 @@ class Place:
         """Return a text that names the file and changes with its content; None if the bucket has no such text."""
 
         def look(path: Path) -> str:
-            seen = path.stat()
-            return f"{seen.st_dev} {seen.st_ino} {seen.st_size} {seen.st_mtime_ns} {seen.st_ctime_ns}"
+            status = path.stat()
+            return f"{status.st_dev} {status.st_ino} {status.st_size} {status.st_mtime_ns} {status.st_ctime_ns}"
 
         tag = self._do(name, look, lambda store, key: store.head(key)["e_tag"])
         return tag if tag is None or self.path else f"{self.where(name)} {tag}"
@@ -260,12 +259,11 @@ def _walk_files(directory: str, above: str) -> Iterator[FileEntry]:
                 yield from _walk_files(entry.path, f"{above}{entry.name}/")
                 continue
             with suppress(FileNotFoundError):
-                seen = entry.stat()
-                yield FileEntry(above + entry.name, seen.st_size, seen.st_mtime_ns)
+                status = entry.stat()
+                yield FileEntry(above + entry.name, status.st_size, status.st_mtime_ns)
 
 
-_READS_AT_ONCE = 4
-"""Files that are hashed at the same time: two cores hash 1 to 3 GB a second, more than a disk reads."""
+_READS_AT_ONCE = 4  # files that are hashed at the same time: two cores hash 1 to 3 GB a second, more than a disk reads
 
 
 def find_wrong_files(place: Place, checksums: Mapping[str, Checksum | None]) -> Iterator[str]:

@@ -41,8 +41,7 @@ CARDS = ("dataset.json", "model.json", "cost-map.json")
 BUILDS = "builds"
 _BUILD = re.compile(rf"({BUILDS}/[0-9a-f]{{16}})/")
 _POINTER = re.compile(r"current\.(\d+)\.([0-9a-f]{16})\.json")
-_KEPT_NS = 7 * 24 * 3600 * 10**9
-"""Time for which a build stays after its replacement, so that readers can finish [ns]."""
+_KEPT_NS = 7 * 24 * 3600 * 10**9  # time for which a build stays after its replacement, so that readers can finish [ns]
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,8 +186,8 @@ def _find_expired(entries: Sequence[FileEntry], pointers: Sequence[_Pointer]) ->
     in_use = {name for pointer in kept for name in (pointer.name, pointer.folder)}
     for name, _, modified_ns in entries:
         if found := _BUILD.match(name) or _POINTER.fullmatch(name):
-            of = found[1] if name.startswith(BUILDS) else name
-            ages[of] = max(modified_ns, ages.get(of, 0))
+            build = found[1] if name.startswith(BUILDS) else name
+            ages[build] = max(modified_ns, ages.get(build, 0))
     return [name for name, modified_ns in ages.items() if modified_ns < earliest and name not in in_use]
 
 

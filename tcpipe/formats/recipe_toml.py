@@ -146,8 +146,7 @@ def load_profiles(recipe: Recipe | IngestSections) -> Profiles:
     return Profiles(recipe.robots, [*recipe.power_sources, *of_tables]).before(load_shipped_profiles())
 
 
-_MOST_DOTS = 1000
-"""On one line: the time of a key grows with the square of its parts."""
+_MOST_DOTS = 1000  # on one line: the time of a key grows with the square of its parts
 
 
 def parse_toml(text: str) -> dict[str, Any]:

@@ -26,8 +26,7 @@ from tcpipe.tables.findings import (
 )
 from tcpipe.tables.levels import TABLES_VERSION, Sensor, TrackInfo
 
-_UNFINISHED = ".active"
-"""Ending of a ROS 1 bag that is being recorded, or was when its recorder died."""
+_UNFINISHED = ".active"  # ending of a ROS 1 bag that is being recorded, or was when its recorder died
 
 
 Options: TypeAlias = Mapping[str, str | int | float | bool | list[str] | dict[str, str] | None]
@@ -125,7 +124,7 @@ class Output:
     runs: tuple[tuple[str, str], ...] = ()
     """Runs and recipes of which it was made: `prune` keeps them."""
     options: Options = field(default_factory=dict)
-    """Options of the last call, by which it can be planned again."""
+    """Options of the last call, to plan it again."""
     exit_code: int = 0
     message: str = ""
     at: str = ""
@@ -152,7 +151,7 @@ class Process:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Call:
-    """A call of a command on a store; without an exit code it has not ended. Times are of the clock of where it ran."""
+    """A call of a command on a store; without an exit code it has not ended. Times are of the clock of its machine."""
 
     command: str
     version: str
@@ -337,7 +336,7 @@ def find_problems(row: RunFacts) -> tuple[Problem, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run(RunFacts):
-    """All that is known of a run: the manifest. ``info`` of a record that was read has the findings again."""
+    """All facts of a run: the manifest. ``info`` of a record that was read includes the findings."""
 
     recipe: IngestSections
     counts: Counts

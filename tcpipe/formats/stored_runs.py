@@ -86,7 +86,7 @@ class StoredRun:
         return find_stream_files(self.place, self.facts)
 
     def streams(self) -> Streams:
-        """Read L1; `StoreError` where it is not there or not as it was written."""
+        """Read L1; `StoreError` if it is missing or has changed."""
         found = read_streams(self.place, self.facts)
         if found is None:
             raise StoreError(f"run {self.name}: its streams cannot be read; ingest the log again with --force")
@@ -114,7 +114,7 @@ def write_streams(directory: Path, streams: Streams, *, key: str) -> None:
 
 
 def read_streams(place: Place, row: RunFacts) -> Streams | None:
-    """Return the streams of a run; None where they are not there, not as they were written, or of another version."""
+    """Return the streams of a run; None if they are missing, changed, or of another version."""
     tables, infos = dict[str, pa.Table](), dict[str, StreamInfo]()
     try:
         for role, path in find_stream_files(place, row).items():
@@ -164,7 +164,7 @@ class _LentTables(Mapping[str, pa.Table]):
         return iter([*self._held, *self._files])
 
     def __len__(self) -> int:
-        """Return how many roles there are."""
+        """Return the number of roles."""
         return len(self._held) + len(self._files)
 
 
@@ -234,7 +234,7 @@ def read_records(place: Place, state: State, but: Collection[str] = ()) -> tuple
     counting = [(name, state.facts[kind][key]) for (kind, key), name in state.names.items() if kind in ("runs", "maps")]
     records: list[RunFacts | StoredMap] = [record for name, record in counting if name not in but]
     damaged = [name for name in state.damaged if name.startswith(("runs/", "maps/"))]
-    for name in state.beaten:
+    for name in state.replaced:
         if name not in but and name.startswith(("runs/", "maps/")):
             cls: type[RunFacts | StoredMap] = RunFacts if name.startswith("runs/") else StoredMap
             try:

@@ -101,8 +101,7 @@ DESCRIPTION = "zarr.json"
 """Name of the file that describes an array or a group."""
 
 _CRC_BYTES = 4
-_ABSENT = 2**64 - 1
-"""Offset of a chunk that is all fill value."""
+_ABSENT = 2**64 - 1  # offset of a chunk that is all fill value
 
 _BLOSC_SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
 
@@ -288,7 +287,7 @@ def open_sharded(
 
 
 def _make_codec(name: str, configuration: Mapping[str, Any]) -> Any:
-    """Return the codec that a description names; it decodes all its settings."""
+    """Return the codec of an array description, for all of its settings."""
     if name == "zstd":
         return numcodecs.Zstd(level=configuration["level"], checksum=configuration["checksum"])
     if name != "blosc":

@@ -194,11 +194,11 @@ def drop_outliers(ticks: Ticks, tests: Tests) -> Floats:
         rows, axes = np.flatnonzero(np.isfinite(value[:, kind, 0])), slice(state.SIZES[kind])
         if rows.size:
             series = tests.fix_innovation[rows] if kind == Kind.FIX else value[rows, kind, axes]
-            off, least = (
+            deviation, least = (
                 np.abs(series - compute_running_median(series, 7)),
                 np.sqrt(ticks.inputs.variance[rows, kind, axes]),
             )
-            is_spike = (off > SPIKE_RATIO * np.maximum(np.median(off, axis=0), least)).any(axis=1)
+            is_spike = (deviation > SPIKE_RATIO * np.maximum(np.median(deviation, axis=0), least)).any(axis=1)
             rejected = tests.verdict[rows, kind] != GateVerdict.ACCEPTED
             for first, last in _find_long_runs(rows, rejected, ticks.inputs.period_s, kind):
                 rejected[first:last] = False

@@ -331,8 +331,8 @@ def _find_fix_prior(
     if axis == "up" or not of_heights:
         return usual, _PROCESS_STD * fixes.claimed_m2
     ratio = horizontal.claimed_m2 / vertical.claimed_m2
-    shown = {each: ratio * variance for each, variance in of_heights.items() if each.startswith("up process")}
-    return shown[f"up process {time_s}"], _AXES_STD * max(sum(shown.values()), horizontal.correlated.variance)
+    by_heights = {each: ratio * variance for each, variance in of_heights.items() if each.startswith("up process")}
+    return by_heights[f"up process {time_s}"], _AXES_STD * max(sum(by_heights.values()), horizontal.correlated.variance)
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:

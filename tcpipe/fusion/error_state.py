@@ -204,10 +204,10 @@ class SectionModel:
         gnss, active = self.measurements.gnss, list(forward.model.active)
         if gnss is None or Error.ARM not in active:
             return self
-        off = np.abs(smoothed.states[-1, Error.ARM + 6 : Error.ARM + 9] - gnss.lever_arm_m)
+        difference = np.abs(smoothed.states[-1, Error.ARM + 6 : Error.ARM + 9] - gnss.lever_arm_m)
         index = active.index(Error.ARM)
         known = smoothed.stds[-1, index : index + 3]
-        if not (off > np.maximum(2.0 * np.asarray(gnss.lever_arm_std_m), MIN_SIGMAS * known)).any():
+        if not (difference > np.maximum(2.0 * np.asarray(gnss.lever_arm_std_m), MIN_SIGMAS * known)).any():
             return self
         m = replace(self.measurements, gnss=replace(gnss, lever_arm_std_m=UNSTATED_ARM_STD_M))
         return replace(self, measurements=m, std=make_priors(m, self.noise, self.ticks)[0])

@@ -213,13 +213,13 @@ def _draw_sigma_point(i: int, m: int, active: Indices, indices: Indices, L: Matr
 @compile_kernel
 def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, F: Matrix, room: Any) -> None:
     """Propagate x and P over the motion of tick k; F becomes the map of the errors on which the motion depends."""
-    L, M, W, missed, d, high, low, centre, turn, up, down = room
+    L, M, W, misfit, d, high, low, centre, turn, up, down = room
     mode = inputs.mode[k]
     row = KINDS + (mode >= Mode.GYRO_TURN)
     indices, m, n = model.depends[row], model.counts[row], P.shape[0]
     move_state(x, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], centre, turn)
     factorize(P, indices, m, L)
-    missed[:] = 0.0
+    misfit[:] = 0.0
     for i in range(m):
         _draw_sigma_point(i, m, model.active, indices, L, d)
         displace_state(x, d, 1.0, low, turn)
@@ -238,7 +238,7 @@ def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, 
                 d[e] = 0.0
         for a in range(m):
             for b in range(m):
-                missed[a, b] += d[model.active[indices[a]]] * d[model.active[indices[b]]] / 3.0
+                misfit[a, b] += d[model.active[indices[a]]] * d[model.active[indices[b]]] / 3.0
     _solve_for_map(M, m, L, m, F)
     for a in range(m):
         W[a] = 0.0
@@ -252,7 +252,7 @@ def _move(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix, 
         P[:, indices[a]] = W[a]
     for a in range(m):
         for b in range(a + 1):
-            s = missed[a, b]
+            s = misfit[a, b]
             for c in range(m):
                 s += W[a, indices[c]] * F[b, c]
             P[indices[a], indices[b]] = s
@@ -290,7 +290,7 @@ def _decay(k: int, inputs: TickInputs, model: FilterModel, x: Vector, P: Matrix,
 
 
 @compile_kernel
-def _compare(
+def _compute_innovation(
     k: int,
     kind: int,
     inputs: TickInputs,
@@ -303,7 +303,7 @@ def _compare(
 ) -> float:
     """Fill innovation, H, P H', S and S⁻¹ of one measurement; return log det S."""
     y, H, Hs, cross, S, inverse = gain
-    L, M, missed, d, high, turn, up, down = room[0], room[1], room[3], room[4], room[5], room[8], room[9], room[10]
+    L, M, misfit, d, high, turn, up, down = room[0], room[1], room[3], room[4], room[5], room[8], room[9], room[10]
     indices, m, size, n = model.depends[kind], model.counts[kind], SIZES[kind], P.shape[0]
     rate, gyro, tau = inputs.rate[k], inputs.has_gyro[k], inputs.tau[k, kind]
     lever = inputs.attitude[k] if kind == Kind.ATTITUDE else inputs.levers[kind]
@@ -311,7 +311,7 @@ def _compare(
     predict_measurement(kind, x, rate, gyro, acceleration, tau, lever, centre)
     y[:] = centre
     factorize(P, indices, m, L)
-    missed[:3, :3] = 0.0
+    misfit[:3, :3] = 0.0
     for i in range(m):
         _draw_sigma_point(i, m, model.active, indices, L, d)
         displace_state(x, d, 1.0, high, turn)
@@ -321,11 +321,11 @@ def _compare(
         for a in range(size):
             M[a, i] = 0.5 / _SPREAD * (up[a] - down[a])
             for b in range(a + 1):
-                missed[a, b] += (0.5 * (up[a] + down[a]) - y[a]) * (0.5 * (up[b] + down[b]) - y[b]) / 3.0
+                misfit[a, b] += (0.5 * (up[a] + down[a]) - y[a]) * (0.5 * (up[b] + down[b]) - y[b]) / 3.0
     if kind == Kind.FIX:  # error of yaw times error of distance since the last fix: sideways
         for a in range(3):
             for b in range(3):
-                missed[a, b] += (
+                misfit[a, b] += (
                     P[Error.THETA + 2, Error.THETA + 2] * P[Error.RHO, Error.RHO] * x[3 * a + 1] * x[3 * b + 1]
                 )
     _solve_for_map(M, size, L, m, Hs)
@@ -339,7 +339,7 @@ def _compare(
                 cross[a, j] += h * line[j]
     for a in range(size):
         for b in range(a + 1):
-            s = missed[a, b]
+            s = misfit[a, b]
             for i in range(m):
                 s += Hs[b, i] * cross[a, indices[i]]
             S[a, b] = s
@@ -411,7 +411,7 @@ def turn_rows(A: Matrix, turn: Vector, columns: int, transposed: bool) -> None:
 
 @compile_kernel
 def _correct(x: Vector, P: Matrix, active: Indices, size: int, gain: Any, K: Matrix, turn: Vector, room: Any) -> None:
-    """Correct x and P by the result of `_compare`; fill K' and the rotation of the axes."""
+    """Correct x and P by the result of `_compute_innovation`; fill K' and the rotation of the axes."""
     y, _, _, cross, _, inverse = gain
     d, high, small = room[4], room[5], room[8]
     n = P.shape[0]
@@ -491,7 +491,7 @@ def filter_ticks(
             if not np.isfinite(inputs.value[k, kind, 0]):
                 continue
             size = SIZES[kind]
-            log_det = _compare(k, kind, inputs, model, x, P, acceleration, gain, room)
+            log_det = _compute_innovation(k, kind, inputs, model, x, P, acceleration, gain, room)
             nis = _compute_nis(y, inverse, size)
             tests.nis[k, kind] = nis
             tests.log_det[k, kind] = log_det
@@ -508,7 +508,7 @@ def filter_ticks(
                         P[measured + i, measured + i] += y[i] * y[i]
                         P[Error.U + i, Error.U + i] += RESET_SPEED_STD_MPS**2
                     P[Error.THETA + 2, Error.THETA + 2] += 0.1**2  # rad
-                    _compare(k, kind, inputs, model, x, P, acceleration, gain, room)
+                    _compute_innovation(k, kind, inputs, model, x, P, acceleration, gain, room)
             tests.verdict[k, kind] = verdict
             if verdict == GateVerdict.REJECTED:
                 continue

@@ -141,12 +141,12 @@ def _estimate_position(
         moved_m = interpolate_signal(grid_s, track.path_m, at_s)
         antenna_m = moved_m + np.column_stack((turned.real, turned.imag, np.full(at_s.size, antenna_m[2])))
         driven_m = STEP_S * float(np.abs(track.speed_mps[grid_s < at_s[-1]]).sum())
-    off = gnss.position_enu_m[few] - antenna_m
+    residual = gnss.position_enu_m[few] - antenna_m
     std: Floats = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
     if not gnss.has_heights:  # heights count from the start: a σ of kilometres would disturb the plane by tilt
         std[2] = 0.0
-    position: Floats = np.median(off, axis=0)
-    return position, std + np.array([0.1, 0.1, 0.2]) * max(driven_m, 1.0) + np.ptp(off, axis=0)
+    position: Floats = np.median(residual, axis=0)
+    return position, std + np.array([0.1, 0.1, 0.2]) * max(driven_m, 1.0) + np.ptp(residual, axis=0)
 
 
 _WINDOW_NS = 500_000_000  # window of means and scatter

@@ -310,7 +310,7 @@ class _Alignment:
             if moving.sum() < _MIN_COUNT:
                 return None
             unit = np.conj(moved) / np.maximum(length, 1e-9)
-            off = fix * unit - length
+            residual = fix * unit - length
             if number == 0:  # a heading at each knot, without a prior
                 seen = np.where(moving, fix * unit / np.maximum(np.abs(fix), 1e-9), 0.0)
                 towards = np.einsum("mk,m->k", self._hats, seen)
@@ -320,8 +320,8 @@ class _Alignment:
                 angle = np.unwrap(np.angle(towards[usable]))
                 fit = replace(fit, turn_rad=np.interp(time_s, self._knots_s[usable], angle))
                 continue
-            noise = float(np.median(np.abs(off[moving]))) + 1e-6
-            root = np.where(moving, 1.0, 0.0) / (1.0 + np.square(np.abs(off) / (2.5 * noise)))
+            noise = float(np.median(np.abs(residual[moving]))) + 1e-6
+            root = np.where(moving, 1.0, 0.0) / (1.0 + np.square(np.abs(residual) / (2.5 * noise)))
             spin = self._compute_changes(np.exp(1j * (self._attitude.yaw_rad + fit.turn_rad))) * unit
             columns = np.column_stack(
                 (length, 1j * length * turn, spin, 1j * spin, self._compute_changes(velocity) * unit, 1j * length[:, None] * self._hats)
@@ -330,9 +330,9 @@ class _Alignment:
             prior = np.concatenate(([1.0, 0.5, 0.3, 0.3, 0.3], np.ones(self._knots_s.size)))
             before = np.zeros(prior.size)
             before[2:5] = fit.arm_m.real, fit.arm_m.imag, fit.offset_s  # these priors apply to the sum of all rounds
-            columns, off = columns * root[:, None], off * root
+            columns, residual = columns * root[:, None], residual * root
             matrix = np.concatenate((columns.real, columns.imag, np.diag(noise / prior)))
-            target = np.concatenate((off.real, off.imag, -before * noise / prior))
+            target = np.concatenate((residual.real, residual.imag, -before * noise / prior))
             found = solve_least_squares(matrix, target)
             fit = _Fit(
                 fit.turn_rad + found[1] * self._turn + np.interp(time_s, self._knots_s, found[5:]),

@@ -90,7 +90,7 @@ class GroundVelocities:
     Attributes
     ----------
     stamp_ns : [ns], shape (N,), int64, increasing.
-    velocity_enu_mps : [m/s], shape (N, 3), east, north, up; up is 0 where it is not measured, its variance
+    velocity_enu_mps : [m/s], shape (N, 3), east, north, up; up is 0 if it is not measured, its variance
         `MAX_VARIANCE`.
     variance_m2ps2 : [m²/s²], shape (N, 3); floored, never unknown.
     """
@@ -178,8 +178,8 @@ class Measurements:
 
     def sensors(self) -> dict[str, Sensor]:
         """Return the existing sensors by role."""
-        every = {role: getattr(self, name) for role, name in _FIELDS.items()}
-        return {role: sensor for role, sensor in every.items() if sensor is not None}
+        sensors_by_role = {role: getattr(self, name) for role, name in _FIELDS.items()}
+        return {role: sensor for role, sensor in sensors_by_role.items() if sensor is not None}
 
     def replace_sensors(self, changed: Mapping[str, Sensor | None]) -> Measurements:
         """Return the measurements with some sensors replaced, by role; None removes a sensor."""
@@ -209,8 +209,8 @@ class Measurements:
 
     def odometries(self) -> dict[str, BodyVelocities]:
         """Return the existing odometries by role, wheels first."""
-        every = {WHEELS: self.wheels, VISUAL: self.visual}
-        return {role: odometry for role, odometry in every.items() if odometry is not None}
+        by_role = {WHEELS: self.wheels, VISUAL: self.visual}
+        return {role: odometry for role, odometry in by_role.items() if odometry is not None}
 
     def turning_odometries(self) -> dict[str, BodyVelocities]:
         """Return the odometries that measure a yaw rate, by role: wheels (which skid), then the camera."""

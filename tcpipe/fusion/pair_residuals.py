@@ -122,16 +122,16 @@ def _compare_fixes(
     """Return the residuals of fixes against an aligned track; ``speed_mps`` (n,) determines whether the robot moves."""
     attitude = section.attitude
     fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
-    off = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
-    off = np.stack([remove_spikes(axis, fill=np.nan) for axis in off.T], -1)
+    difference = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
+    difference = np.stack([remove_spikes(axis, fill=np.nan) for axis in difference.T], -1)
     if gnss.unclaimed is not None and gnss.has_claims:  # the recipe's variance for unclaimed fixes is a guess
-        off[gnss.unclaimed] = np.nan
+        difference[gnss.unclaimed] = np.nan
     has_others = len(section.measurements.odometries()) > 1
     sources = (section.measurements.odometries()[role].stamp_ns, attitude.source_ns)
-    made = []
+    residuals = []
     for time_s, first, last in section.choose_windows(gnss.stamp_ns, sources):
         window = _Window(track, attitude, fix_s[first], fix_s[last])
-        change = off[last] - off[first]
+        change = difference[last] - difference[first]
         cosine, sine = np.cos(window.heading_rad), np.sin(window.heading_rad)
         values = {
             ALONG: cosine * change[:, 0] + sine * change[:, 1],
@@ -145,8 +145,8 @@ def _compare_fixes(
             features = _describe_fixes(gnss, axis, first, last, time_s)
             features |= window.describe(role, axis, has_others=has_others)
             stamps = gnss.stamp_ns[first], gnss.stamp_ns[last]
-            made.append(Residuals((GNSS, role), axis, time_s, *stamps, value, features, is_still))
-    return made
+            residuals.append(Residuals((GNSS, role), axis, time_s, *stamps, value, features, is_still))
+    return residuals
 
 
 def _describe_fixes(gnss: Positions, axis: str, first: Ints, last: Ints, time_s: float) -> dict[str, Floats]:
@@ -176,16 +176,18 @@ def _compare_odometries(
     scale = float(np.median(moved[1][moves] / moved[0][moves]))
     if scale <= 0.0:
         return []
-    off = length[0] - length[1] / scale
-    made = []
+    difference = length[0] - length[1] / scale
+    residuals = []
     straight = replace(first, heading_rad=np.zeros(time_s.size))
     sources = [section.attitude.source_ns, *(section.measurements.odometries()[role].stamp_ns for role in pair)]
     for window_s, i, j in section.choose_windows(at_ns, sources):
         window = _Window(straight, section.attitude, at_s[i], at_s[j])
         features = window.describe_odometry(pair[0], ALONG) | window.describe_odometry(pair[1], ALONG)
         is_still = window.length_m < _STILL_MPS * window_s
-        made.append(Residuals(pair, ALONG, window_s, at_ns[i], at_ns[j], off[j] - off[i], features, is_still))
-    return made
+        residuals.append(
+            Residuals(pair, ALONG, window_s, at_ns[i], at_ns[j], difference[j] - difference[i], features, is_still)
+        )
+    return residuals
 
 
 def _take_nodes(values: Floats, start_s: Floats, end_s: Floats) -> Floats:

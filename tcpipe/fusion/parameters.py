@@ -130,8 +130,8 @@ def _find_lasting_std_m(gnss: Positions, m: Measurements, noise: NoiseModel) -> 
     slopes.
     """
     axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
-    shown, claimed = np.array([(fix.white + fix.correlated.variance, fix.claimed_m2) for fix in axes]).T
-    variance = np.maximum(claimed - shown, _UNSEEN_SHARE * claimed * (claimed < MAX_VARIANCE))
+    observed, claimed = np.array([(fix.white + fix.correlated.variance, fix.claimed_m2) for fix in axes]).T
+    variance = np.maximum(claimed - observed, _UNSEEN_SHARE * claimed * (claimed < MAX_VARIANCE))
     variance += np.where(_find_arm_axes(m), 0.0, np.square(gnss.lever_arm_std_m))
     if not m.has_tilt and (m.is_antenna_alone or not gnss.has_heights):
         variance[:2] += (SLOPE_RAD * gnss.lever_arm_m[2]) ** 2

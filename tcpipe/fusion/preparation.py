@@ -105,12 +105,12 @@ def prepare_positions(
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
     prepared = Prepared(stamp_ns[~is_fix], repeated, replaced)
     unclaimed_rows = unclaimed if unclaimed.any() else None
-    made = Positions(stamp_ns[usable], fixes, variance, lever_arm_m, lever_arm_std_m, unclaimed_rows)
+    positions = Positions(stamp_ns[usable], fixes, variance, lever_arm_m, lever_arm_std_m, unclaimed_rows)
     if "quat_x" in columns:
         frame, quat = _stack_columns(columns, ("x_m", "y_m")), _stack_columns(columns, _QUAT)
         rotation_variance = _stack_columns(columns, [f"rotation_{axis}_var" for axis in "xyz"])
-        made = add_attitude(made, frame[usable], quat[usable], rotation_variance[usable], mounting_xyzw)
-    return made, prepared
+        positions = add_attitude(positions, frame[usable], quat[usable], rotation_variance[usable], mounting_xyzw)
+    return positions, prepared
 
 
 def _compute_rounding_variances(values: Floats) -> Floats:
@@ -161,7 +161,7 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
 
     If a driver stamps a fix when it sends it, positions seem to stop and then to jump. The distance between two fixes
     is compared with that of the odometry, times the local ratio of the two (slip). Jitter is the scatter of this
-    residual beyond the stated noise, divided by speed. It is 0 where it is small or unknown; a stationary robot has the
+    residual beyond the stated noise, divided by speed. It is 0 if it is small or unknown; a stationary robot has the
     jitter of the nearest motion. The variance grows by (2 speed jitter)², because errors of successive late fixes are
     correlated.
     """
@@ -225,8 +225,8 @@ def prepare_ground_velocities(
     default = np.square(default_std_mps * np.array([1.0, 1.0, 2.0]))
     variance, replaced = _clean_variances(variance, default, _VELOCITY_FLOOR_MPS**2)
     variance[np.isnan(velocity[:, 2]), 2] = MAX_VARIANCE
-    made = GroundVelocities(stamp_ns[usable], np.nan_to_num(velocity), variance)
-    return made, Prepared(stamp_ns[~measured], repeated, replaced)
+    velocities = GroundVelocities(stamp_ns[usable], np.nan_to_num(velocity), variance)
+    return velocities, Prepared(stamp_ns[~measured], repeated, replaced)
 
 
 def prepare_body_velocities(
@@ -399,8 +399,8 @@ def _is_known(variance: Floats) -> Mask:
 def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[Floats, int]:
     """Return usable variances (N, k), and the number of replaced rows: default, or the median if larger."""
     known = _is_known(variance)
-    usual = [np.median(axis[rows]) if rows.any() else 0.0 for axis, rows in zip(variance.T, known.T, strict=True)]
-    filled = np.clip(np.where(known, variance, np.maximum(default, usual)), floor, MAX_VARIANCE)
+    medians = [np.median(axis[rows]) if rows.any() else 0.0 for axis, rows in zip(variance.T, known.T, strict=True)]
+    filled = np.clip(np.where(known, variance, np.maximum(default, medians)), floor, MAX_VARIANCE)
     return filled, int((~known).any(1).sum())
 
 

@@ -191,5 +191,5 @@ def _estimate_slide_density(visual: BodyVelocities | None) -> float:
     """Return the density of sideways and upward velocity [m²/s³] from visual odometry, or a default without it."""
     if visual is None or visual.stamp_ns.size < 3:
         return 4e-4
-    shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], 1.0) for axis in (1, 2)]  # window [s]
-    return max(_MIN_DENSITY, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)
+    slopes = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], 1.0) for axis in (1, 2)]  # window [s]
+    return max(_MIN_DENSITY, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(slopes)) ** 2)

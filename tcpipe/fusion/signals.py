@@ -124,8 +124,12 @@ def remove_spikes(values: Floats, *, fill: float | None = None) -> Floats:
     """Return a signal (N,) with spikes (far from the median of five samples) interpolated, or replaced by ``fill``."""
     if values.size < 5:
         return values
-    off = np.abs(values - compute_running_median(values))
-    is_spike = off > SPIKE_RATIO * float(np.median(off[off > 0.0])) if (off > 0.0).any() else off > 0.0
+    deviation = np.abs(values - compute_running_median(values))
+    is_spike = (
+        deviation > SPIKE_RATIO * float(np.median(deviation[deviation > 0.0]))
+        if (deviation > 0.0).any()
+        else deviation > 0.0
+    )
     rows = np.arange(values.size)
     return np.where(is_spike, np.interp(rows, rows[~is_spike], values[~is_spike]) if fill is None else fill, values)
 

@@ -174,9 +174,9 @@ class _Filter:
 
     def _displace(self, x: Floats, errors: Floats) -> Floats:
         """Return a state displaced by active errors, shape (n,)."""
-        every, displaced = np.zeros(state.N), np.empty(state.NX)
-        every[self._model.active] = errors
-        state.displace_state(x, every, 1.0, displaced, np.empty(9))
+        all_errors, displaced = np.zeros(state.N), np.empty(state.NX)
+        all_errors[self._model.active] = errors
+        state.displace_state(x, all_errors, 1.0, displaced, np.empty(9))
         return displaced
 
     def _correct(self) -> None:

@@ -17,8 +17,7 @@ from tcpipe.compiled import compile_kernel
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NS = 1e-9
-_PARTS = 8
-"""Parts of an interval that are searched: 6 ms at 20 Hz."""
+_PARTS = 8  # parts of an interval that are searched: 6 ms at 20 Hz
 
 
 def find_row_before(stamp_ns: Ints, at_ns: Ints) -> NDArray[np.intp]:

@@ -143,11 +143,11 @@ def compare_with_baseline(
     for quantity, measured in part.costs.items():
         if quantity not in theirs.costs:
             continue
-        mine, other = ((said.costs[quantity] - measured) ** 2 for said in (ours, theirs))
+        model_squares, other = ((said.costs[quantity] - measured) ** 2 for said in (ours, theirs))
         yield BaselineResult(
             baseline=name, split=split, quantity=quantity,
             errors=compute_errors(theirs.costs[quantity], measured, LEAST[quantity]),
-            rmse_ratio=compare_errors(mine, other, groups, seed=seed), groups=len(np.unique(groups)), drawn_by=drawn_by,
+            rmse_ratio=compare_errors(model_squares, other, groups, seed=seed), groups=len(np.unique(groups)), drawn_by=drawn_by,
         )  # fmt: skip
 
 
@@ -192,6 +192,6 @@ def describe_ratios(found: Sequence[BaselineResult]) -> list[str]:
 
 
 def find_best(found: Sequence[BaselineResult], split: str, quantity: str) -> BaselineResult | None:
-    """Return the baseline with the smallest RMSE of a quantity of a split; None where no ratio is known."""
+    """Return the baseline with the smallest RMSE of a quantity of a split; None if no ratio is known."""
     rows = [row for row in found if (row.split, row.quantity) == (split, quantity) and row.rmse_ratio.value is not None]
     return min(rows, key=lambda row: row.errors.rmse or 0.0, default=None)

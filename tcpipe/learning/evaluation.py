@@ -110,7 +110,7 @@ class Leakage:
     """Share of samples whose footprint overlaps that of a training sample, by the dataset's audit [%]."""
 
     def __str__(self) -> str:
-        """Return how near to training a split is, in words."""
+        """Return the distance of a split from training samples, as text."""
         sharing = "" if self.sharing_percent is None else f"; {self.sharing_percent:.0f} % share ground with one"
         return (
             f"Audit (test held out by {self.holdout}): the middles of {self.near_percent:.0f} % of these samples are "
@@ -201,48 +201,50 @@ def evaluate(
     model: Location, dataset: Location, config: EvaluateConfig, *, key: str, predictor: str | None = None
 ) -> tuple[Evaluation, pa.Table]:
     """Measure a model on a dataset; return the evaluation, with the hash ``key``, and the table of all predictions."""
-    ours = load_model(model, predictor)
-    data = open_dataset(dataset, label=ours.card.label_energy)
-    check_fit(ours.card, data, str(model))
-    names = {entry.id: entry.name for entry in ours.card.class_table.classes}
+    evaluated = load_model(model, predictor)
+    data = open_dataset(dataset, label=evaluated.card.label_energy)
+    check_fit(evaluated.card, data, str(model))
+    names = {entry.id: entry.name for entry in evaluated.card.class_table.classes}
     sets = {name: found for name in SPLITS if len((found := collect_measured(data[name], names)).split)}
     if not sets:
         raise DatasetError(
             f"{data.path}: no labelled samples in test nor unseen: nothing to evaluate on; build it with a --split"
         )
-    said = {name: predict_costs(ours, found.split) for name, found in sets.items()}
-    spreads = {name: predict_spreads(ours, said[name], found) for name, found in sets.items()}
+    predictions = {name: predict_costs(evaluated, found.split) for name, found in sets.items()}
+    spreads = {name: predict_spreads(evaluated, predictions[name], found) for name, found in sets.items()}
     for name, found in sets.items():
         logger.info("%s: %d samples of %s", name, len(found.split), ", ".join(found.names.values()))
 
-    baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
+    baselines, lacking = compare_baselines(evaluated, data, sets, predictions, seed=config.seed)
     known = {**load_shipped_profiles().robots, **data.card.recipe.robots}
     evaluation = Evaluation(
         tcpipe_version=__version__,
         key=key,
-        model=EvaluatedModel(ours.name, ours.checksum, ours.card.training, ours.card.label_energy),
+        model=EvaluatedModel(evaluated.name, evaluated.checksum, evaluated.card.training, evaluated.card.label_energy),
         dataset=EvaluatedDataset(data.card.name, compute_dataset_checksum(data.card), data.card.splits),
         config=config,
-        splits={name: _measure_split(data, part, said[name], spreads[name]) for name, part in sets.items()},
-        ablation=tuple(_iterate_ablation(ours, sets, config)),
-        time=_compare_times(ours, sets, said, max_velocity_mps=known.get(ours.card.robot, Robot()).max_velocity_mps),
+        splits={name: _measure_split(data, part, predictions[name], spreads[name]) for name, part in sets.items()},
+        ablation=tuple(_iterate_ablation(evaluated, sets, config)),
+        time=_compare_times(
+            evaluated, sets, predictions, max_velocity_mps=known.get(evaluated.card.robot, Robot()).max_velocity_mps
+        ),
         baselines=tuple(baselines),
     )
-    findings = (*lacking, *_find_mismatches(ours, data, sets), *find_weaknesses(evaluation))
+    findings = (*lacking, *_find_mismatches(evaluated, data, sets), *find_weaknesses(evaluation))
     evaluation = replace(evaluation, findings=findings, verdict=judge(findings))
     return evaluation, make_predictions_table(
-        sets, {name: predicted.costs for name, predicted in said.items()}, spreads
+        sets, {name: predicted.costs for name, predicted in predictions.items()}, spreads
     )
 
 
-def _measure_split(data: Dataset, found: Measured, said: Predicted, spreads: Mapping[str, Spread]) -> SplitErrors:
+def _measure_split(data: Dataset, found: Measured, predicted: Predicted, spreads: Mapping[str, Spread]) -> SplitErrors:
     runs, start_ns = found.split.column("run_id"), found.split.column("start_ns")
     counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
     return SplitErrors(
         samples=len(found.split),
         classes=counts,
         class_order=tuple(counts),
-        errors=compute_errors_by_class(said.costs, found.costs, found.class_ids, found.names, spreads),
+        errors=compute_errors_by_class(predicted.costs, found.costs, found.class_ids, found.names, spreads),
         coverage={
             quantity: measure_coverage(
                 (spread.low <= found.costs[quantity]) & (found.costs[quantity] <= spread.high), runs
@@ -250,9 +252,9 @@ def _measure_split(data: Dataset, found: Measured, said: Predicted, spreads: Map
             for quantity, spread in spreads.items()
         },
         path_error_percent={
-            quantity: compute_path_error(said.costs[quantity], found.costs[quantity], runs, start_ns)
+            quantity: compute_path_error(predicted.costs[quantity], found.costs[quantity], runs, start_ns)
             for quantity in "TE"
-            if quantity in said.costs
+            if quantity in predicted.costs
         },
         leakage=measure_leakage(data, found.split),
         label_floor=compute_label_floor(found.own_deviations, found.costs, found.class_ids, found.names),
@@ -279,10 +281,10 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig) -> Iterat
         yield AblationRow(letters, by_split)
 
 
-def _compute_errors(said: Predicted, found: Measured, by: Model) -> dict[str, Errors]:
+def _compute_errors(predicted: Predicted, found: Measured, by: Model) -> dict[str, Errors]:
     """Return the errors of all classes, with the scores of the stated errors."""
-    spreads = predict_spreads(by, said, found)
-    by_class = compute_errors_by_class(said.costs, found.costs, found.class_ids, found.names, spreads)
+    spreads = predict_spreads(by, predicted, found)
+    by_class = compute_errors_by_class(predicted.costs, found.costs, found.class_ids, found.names, spreads)
     return {quantity: by_class[quantity][ALL] for quantity in by_class}
 
 
@@ -318,12 +320,14 @@ def _find_mismatches(ours: Model, data: Dataset, sets: Sets) -> Iterator[Finding
 
 
 def measure_leakage(data: Dataset, held: Split) -> Leakage | None:
-    """Return how near the samples of a split are to those of train; None where either has no samples with a place."""
+    """Return distances of the samples of a split from training samples; None if either has no positions."""
     names = PLACES if held.has_coordinates else LOCAL_PLACES
-    ours, theirs = (compute_middles([part.column(name) for name in names]) for part in (held, data["train"]))
+    held_middles, train_middles = (
+        compute_middles([part.column(name) for name in names]) for part in (held, data["train"])
+    )
     within_m = CLOSE * data.card.recipe.segment.chord_m
-    near = are_near(ours, theirs, within_m=within_m, in_degrees=held.has_coordinates)
-    if not len(near) or not len(theirs):
+    near = are_near(held_middles, train_middles, within_m=within_m, in_degrees=held.has_coordinates)
+    if not len(near) or not len(train_middles):
         return None
     audit = next((part for part in data.card.split.audit if part.split == held.name and part.samples), None)
     sharing = None if audit is None else 100.0 * audit.overlapping_samples / audit.samples

@@ -123,9 +123,9 @@ def run_evaluation(
 def _check_directory(place: Path) -> None:
     """Raise `UsageError` for something else than an earlier evaluation."""
     clear(place)
-    ours = {JSON, PAGE, SAMPLES, "drives.json"}
+    own_files = {JSON, PAGE, SAMPLES, "drives.json"}
     if place.exists() and (
-        not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
+        not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - own_files
     ):
         raise UsageError(f"{place}: exists and is no evaluation; it is not changed; give another OUT")
 

@@ -273,17 +273,17 @@ _WHOLE_JOULE = 10.0  # RMSE of E from which whole joules are printed [J], so tha
 def draw_predictions(table: pa.Table, audit: str) -> PageSection:
     """Return a point for each sample, E and T; ``audit`` gives their distance from training samples."""
     text = "Each point is a segment, coloured by class; on the line the prediction is exact. Point at one for its name."
-    drawn = table.slice(0, _MOST_DRAWN)
-    if drawn.num_rows < table.num_rows:
-        text += f" {drawn.num_rows} of {table.num_rows} are drawn, at random."
-    class_id, names = drawn.column("terrain_class").to_numpy(), to_texts(drawn.column("terrain_name"))
+    plotted = table.slice(0, _MOST_DRAWN)
+    if plotted.num_rows < table.num_rows:
+        text += f" {plotted.num_rows} of {table.num_rows} are drawn, at random."
+    class_id, names = plotted.column("terrain_class").to_numpy(), to_texts(plotted.column("terrain_name"))
     found = dict(zip(class_id.tolist(), map(str, names), strict=True))
     classes = [TerrainClass(number, found[number], traversable=True) for number in sorted(found)]
     legend = {found[number]: colour for number, colour in choose_class_colours(classes).items()}
     plots = list[Plot]()
     for quantity in ("E", "T"):
-        label, said = (to_floats(drawn, make_column_name(quantity, part)) for part in ("", "predicted"))
-        known = np.isfinite(label + said)
+        label, predicted = (to_floats(plotted, make_column_name(quantity, part)) for part in ("", "predicted"))
+        known = np.isfinite(label + predicted)
         if not known.any():
             continue
         plot = make_plot(
@@ -297,8 +297,8 @@ def draw_predictions(table: pa.Table, audit: str) -> PageSection:
             height_px=380,
         )
         source = {
-            "x": label[known], "y": said[known], "colour": [legend[str(name)] for name in names[known]],
-            "text": to_texts(drawn.column("sample_id"))[known].tolist(),
+            "x": label[known], "y": predicted[known], "colour": [legend[str(name)] for name in names[known]],
+            "text": to_texts(plotted.column("sample_id"))[known].tolist(),
         }  # fmt: skip
         show_text(plot, plot.figure.scatter("x", "y", size=5, color="colour", alpha=0.6, source=source))
         ends = [float(label[known].min()), float(label[known].max())]
@@ -328,7 +328,7 @@ def make_worst_section(table: pa.Table) -> PageSection:
 def make_slope_section(table: pa.Table) -> PageSection:
     """Return the RMSE of E, or of T without energy, by split, class and range of slope, as a heat map."""
     part, quantity = table.filter(pc.is_valid(table.column("slope_rad"))), find_main_cost(table)
-    off = compute_cost_errors(part, quantity)
+    errors_ = compute_cost_errors(part, quantity)
     ranges = np.searchsorted(np.radians(_SLOPE_EDGES_DEG), to_floats(part, "slope_rad"), side="right")
     label, low, high = (
         to_floats(part, make_column_name(quantity, kind)) for kind in ("", "predicted_low", "predicted_high")
@@ -340,7 +340,7 @@ def make_slope_section(table: pa.Table) -> PageSection:
     cells = {
         (*line, at): (splits == line[0]) & (classes == line[1]) & (ranges == at) for line in lines for at in columns
     }
-    errors = {cell: off[rows & np.isfinite(off)] for cell, rows in cells.items()}
+    errors = {cell: errors_[rows & np.isfinite(errors_)] for cell, rows in cells.items()}
     rmse = {cell: float(np.sqrt(np.mean(part**2))) for cell, part in errors.items() if len(part)}
     most = max(rmse.values(), default=1.0) or 1.0
     digits = 0 if most >= _WHOLE_JOULE else 2

@@ -65,7 +65,7 @@ class Spread:
     high: Floats
 
     def take(self, rows: Mask) -> Spread:
-        """Return some of them."""
+        """Return the spread of some rows."""
         return Spread(self.std[rows], self.low[rows], self.high[rows])
 
 
@@ -84,9 +84,9 @@ def compute_errors(predicted: Floats, measured: Floats, least: float = 0.0, spre
 _LEAST_STD = 1e-9  # least standard deviation; labels that are all equal have none
 
 
-def _compute_scores(off: Floats, measured: Floats, spread: Spread) -> tuple[float, float, float]:
+def _compute_scores(error: Floats, measured: Floats, spread: Spread) -> tuple[float, float, float]:
     std = np.maximum(spread.std, _LEAST_STD)
-    z = off / std
+    z = error / std
     density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
     crps = std * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))
     nll = np.log(std) + z**2 / 2.0 + np.log(2.0 * np.pi) / 2.0
@@ -172,9 +172,9 @@ def compute_path_error(predicted: Floats, measured: Floats, runs: GenericArray, 
     for rows in np.split(order, np.flatnonzero(runs[order][1:] != runs[order][:-1]) + 1):
         for path in np.array_split(rows, max(len(rows) // PATH_M, 1)):
             sums.append((float(predicted[path].sum()), float(measured[path].sum())))
-    said, true = np.array(sums).T
+    predicted_sums, true = np.array(sums).T
     size = float(np.abs(true).mean())
-    return 100.0 * float(np.sqrt(np.mean((said - true) ** 2))) / size if size else 0.0
+    return 100.0 * float(np.sqrt(np.mean((predicted_sums - true) ** 2))) / size if size else 0.0
 
 
 def compute_costs(power_watt: Floats, velocity_mps: Floats, chord_m: float) -> dict[str, Floats]:

@@ -109,30 +109,30 @@ class Model:
             )
         known = fill_unknown(inputs.extra_features, features or empty_extra_features(len(patches)))
         with report_errors(self.own):
-            said = ask_predictor(self.predictor, patches, known, inputs.outputs)
+            prediction = ask_predictor(self.predictor, patches, known, inputs.outputs)
         names = [name.removeprefix("fused_") for name in inputs.outputs]
         if "velocity_mps" in names:
             column = names.index("velocity_mps")
-            said.mean[:, column] = np.maximum(said.mean[:, column], LEAST_VELOCITY_MPS)
-        return said.add_unknown_power() if inputs.is_time_alone else said
+            prediction.mean[:, column] = np.maximum(prediction.mean[:, column], LEAST_VELOCITY_MPS)
+        return prediction.add_unknown_power() if inputs.is_time_alone else prediction
 
     def predict(self, patches: Floats32, features: ExtraFeatures | None = None) -> Prediction:
         """Return power [W] and velocity [m/s] of patches as `ask`, with the covariances of their errors on new ground.
 
         The covariances come from held-out predictions, which also scale those that the model states.
         """
-        said, errors = self.ask(patches, features), self.errors
-        if errors is None or said.mean.shape[1] != 2:
-            return said
+        prediction, errors = self.ask(patches, features), self.errors
+        if errors is None or prediction.mean.shape[1] != 2:
+            return prediction
         class_id = np.zeros(len(patches), np.int64) if features is None else features.class_id
-        stated = np.sqrt(np.diagonal(said.covariance, axis1=1, axis2=2)).T
+        stated = np.sqrt(np.diagonal(prediction.covariance, axis1=1, axis2=2)).T
         std = np.stack([
             errors[name].compute_std(value, class_id, stated_std) if name in errors else np.full(len(value), np.nan)
-            for name, value, stated_std in zip(("power", "velocity"), said.mean.T, stated, strict=True)
+            for name, value, stated_std in zip(("power", "velocity"), prediction.mean.T, stated, strict=True)
         ])  # fmt: skip
         covariance = std.T[:, :, None] * std.T[:, None, :]
         covariance[:, [0, 1], [1, 0]] *= self._correlation
-        return Prediction(said.mean, covariance)
+        return Prediction(prediction.mean, covariance)
 
 
 def write_model(

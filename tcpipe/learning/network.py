@@ -175,7 +175,7 @@ class Trainer:
         return sha256(packed).digest() + packed
 
     def read_state(self, path: Path) -> dict[str, Any]:
-        """Continue from a file of `pack_state`, and return the other parts; `ModelError` where it is damaged."""
+        """Continue from a file of `pack_state`, and return the other parts; `ModelError` if it is damaged."""
         try:
             data = path.read_bytes()
             packed = data[_DIGEST_BYTES:] if sha256(data[_DIGEST_BYTES:]).digest() == data[:_DIGEST_BYTES] else b""

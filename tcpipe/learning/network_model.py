@@ -96,7 +96,7 @@ class _State:
         self.written_s = time.monotonic()
 
     def read(self, path: Path) -> None:
-        """Continue from a file of `write`; `ModelError` where it is damaged."""
+        """Continue from a file of `write`; `ModelError` if it is damaged."""
         parts = self.trainer.read_state(path)
         self.progress, self.best = TrainingProgress(**parts["progress"]), parts["best"]
 

@@ -212,8 +212,8 @@ class CurveModel(Predictor):
     @classmethod
     def fit(cls, samples: Samples) -> CurveModel:
         """Fit a curve of every class."""
-        of = samples.features
-        return cls(fit_curves(of.slope_rad, of.class_id, samples.labels, quantiles=cls.quantiles))
+        features = samples.features
+        return cls(fit_curves(features.slope_rad, features.class_id, samples.labels, quantiles=cls.quantiles))
 
     def to_arrays(self) -> dict[str, GenericArray]:
         """Return the curves by name."""

@@ -73,17 +73,17 @@ class Predicted:
 
     costs: Mapping[str, Floats]
     stated: Mapping[str, Floats]
-    """Standard deviations by the predictor; 0 where it states none."""
+    """Standard deviations by the predictor; 0 if it states none."""
 
     @classmethod
-    def centre(cls, residuals: Residuals, said: Prediction, class_ids: Ints, chord_m: float) -> Predicted:
+    def centre(cls, residuals: Residuals, prediction: Prediction, class_ids: Ints, chord_m: float) -> Predicted:
         """Return costs of predictions of power and velocity, by the predictor's own held-out samples."""
         is_time = "velocity_mps" in residuals and "power_watt" not in residuals
         names = ("v", "T") if is_time else QUANTITIES
-        power, velocity = said.mean[:, 0], np.maximum(said.mean[:, 1], LEAST_VELOCITY_MPS)
+        power, velocity = prediction.mean[:, 0], np.maximum(prediction.mean[:, 1], LEAST_VELOCITY_MPS)
         centred_power, centred_velocity = fit_bias_correction(residuals).apply(power, velocity, class_ids)
         costs = compute_costs(centred_power, np.maximum(centred_velocity, LEAST_VELOCITY_MPS), chord_m)
-        of_metre = propagate_stated(np.column_stack([power, velocity]), said.covariance)
+        of_metre = propagate_stated(np.column_stack([power, velocity]), prediction.covariance)
         stated = {name: of_metre[CALLED[name]] * (chord_m if name in "TE" else 1.0) for name in names}
         return cls({name: costs[name] for name in names}, stated)
 
@@ -109,7 +109,7 @@ def predict_costs(model: Model, split: Split, *, noise: Sequence[str] = (), seed
     return Predicted.centre(model.residuals, Prediction.concatenate(parts), class_ids, model.card.chord_m)
 
 
-def predict_spreads(model: Model, said: Predicted, found: Measured) -> dict[str, Spread]:
+def predict_spreads(model: Model, predicted: Predicted, found: Measured) -> dict[str, Spread]:
     """Return the error models of a model's costs, by quantity; none if it has too few held-out samples."""
     if model.errors is None:
         return {}
@@ -117,9 +117,9 @@ def predict_spreads(model: Model, said: Predicted, found: Measured) -> dict[str,
     if found.split.has_coordinates:
         is_near = model.find_near(compute_middles([found.split.column(name) for name in PLACES]))
     spreads = {}
-    for quantity, costs in said.costs.items():
+    for quantity, costs in predicted.costs.items():
         errors, d = model.errors[CALLED[quantity]], model.card.chord_m if quantity in "TE" else 1.0
-        ground = costs / d, found.class_ids, said.stated[quantity] / d, is_near  # errors are of a metre
+        ground = costs / d, found.class_ids, predicted.stated[quantity] / d, is_near  # errors are of a metre
         low, high = errors.compute_intervals(*ground)
         spreads[quantity] = Spread(d * errors.compute_std(*ground), d * low, d * high)
     return spreads

@@ -78,7 +78,7 @@ class Prediction:
     mean: Floats
     """Shape (N, outputs)."""
     covariance: Floats
-    """Shape (N, outputs, outputs); 0 where a model states none."""
+    """Shape (N, outputs, outputs); 0 if a model states none."""
 
     @classmethod
     def without_covariance(cls, mean: Labels) -> Prediction:
@@ -202,7 +202,7 @@ class Predictor(Protocol):
 
     @classmethod
     def from_arrays(cls, arrays: NamedArrays, inputs: Inputs) -> Predictor:
-        """Return the model of `to_arrays`; `ModelError` where the arrays are those of another."""
+        """Return the model of `to_arrays`; `ModelError` if the arrays are those of another."""
         del arrays, inputs
         return cls()
 
@@ -218,7 +218,7 @@ KINDS: Mapping[ModelKind, str] = {
 
 
 AUTOMATIC: tuple[ModelKind, ...] = ("linear", "physics", "boosting")
-"""Kinds of which one is chosen where none is asked for, simplest first."""
+"""Kinds from which the default is chosen, simplest first."""
 
 
 def find_kind(name: ModelKind) -> type[Predictor]:
@@ -233,8 +233,8 @@ def cross_predict(kind: type[Predictor], samples: Samples, parts: GenericArray) 
     out = Prediction.without_covariance(np.empty_like(samples.labels))
     for part in np.unique(parts):
         held = parts == part
-        said = predict_samples(kind.fit(samples.take(~held)), samples.take(held))
-        out.mean[held], out.covariance[held] = said.mean, said.covariance
+        prediction = predict_samples(kind.fit(samples.take(~held)), samples.take(held))
+        out.mean[held], out.covariance[held] = prediction.mean, prediction.covariance
     return out
 
 
@@ -261,19 +261,19 @@ _ROUNDING = 1e-6  # negative share of the largest eigenvalue up to which a covar
 def ask_predictor(
     predictor: Predictor, patches: Patches, features: ExtraFeatures, outputs: Sequence[str]
 ) -> Prediction:
-    """Return predictions of patches; `ModelError` where a model gives something else."""
-    said, count, named = predictor.predict(patches, features), len(outputs), " and ".join(outputs)
+    """Return predictions of patches; `ModelError` if a model gives something else."""
+    prediction, count, named = predictor.predict(patches, features), len(outputs), " and ".join(outputs)
     name = type(predictor).__name__
     who = name if name == "predict" else f"{name}.predict"
-    is_pair = isinstance(said, tuple) and len(said) == 2
-    mean: Floats = np.array(said[0] if is_pair else said, float)
+    is_pair = isinstance(prediction, tuple) and len(prediction) == 2
+    mean: Floats = np.array(prediction[0] if is_pair else prediction, float)
     if mean.shape != (len(patches), count):
         raise ModelError(
             f"{who} returned shape {mean.shape}, expected {(len(patches), count)}: {named} of {len(patches)} patches"
         )
     if not is_pair:
         return Prediction.without_covariance(mean)
-    covariance: Floats = np.array(said[1], float)
+    covariance: Floats = np.array(prediction[1], float)
     if covariance.shape != (*mean.shape, count):
         raise ModelError(
             f"{who} returned covariances of shape {covariance.shape}, expected {(*mean.shape, count)}: those of {named}"

@@ -117,10 +117,11 @@ def _compute_losses(samples: Samples, predicted: Floats) -> Floats:
     """Return the squared errors of T and E over their variances, shape (N,)."""
     if len(samples.inputs.outputs) == 1:
         return np.asarray(np.square((predicted - samples.labels) / samples.labels.std())[:, 0])
-    said = compute_costs(predicted[:, 0], np.maximum(predicted[:, 1], LEAST_VELOCITY_MPS), 1.0)
+    costs = compute_costs(predicted[:, 0], np.maximum(predicted[:, 1], LEAST_VELOCITY_MPS), 1.0)
     true = compute_costs(samples.labels[:, 0], samples.labels[:, 1], 1.0)
     losses = [
-        np.square((said[quantity] - true[quantity]) / max(float(true[quantity].std()), 1e-9)) for quantity in ("T", "E")
+        np.square((costs[quantity] - true[quantity]) / max(float(true[quantity].std()), 1e-9))
+        for quantity in ("T", "E")
     ]
     return np.asarray(np.sum(losses, axis=0))
 
@@ -415,10 +416,12 @@ def _make_residuals_table(samples: Samples, fitted: Fitted, near: Prediction) ->
     """Return labels and predictions of held-out samples, one row per sample."""
     held_out, is_held = fitted.held_out, find_held_out(fitted.held_out)
 
-    held, said, labels = samples.split.take(is_held), held_out.take(is_held), samples.labels[is_held]
+    held, predictions, labels = samples.split.take(is_held), held_out.take(is_held), samples.labels[is_held]
     # the common error of all labels is in no residual
     names = "sample_id", "run_id", "start_ns", "terrain_class", "fold", "duration_s", "duration_common_std_s"
-    columns = {name: held.column(name) for name in names} | make_residuals(labels, said.mean, said.covariance)
+    columns = {name: held.column(name) for name in names} | make_residuals(
+        labels, predictions.mean, predictions.covariance
+    )
     columns |= dict(zip(NEAR[-near.mean.shape[1] :], near.take(is_held).mean.T, strict=True))
     columns["energy_common_std_joule"] = held.column(name_common_std(held.energy.energy_std))
     return pa.table(columns)

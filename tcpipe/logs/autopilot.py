@@ -200,8 +200,10 @@ def _convert_px4_imu(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> 
 
 def _convert_px4_battery(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     voltage, current = f["voltage_v"], f["current_a"]
-    drawn = np.where(np.isin(current, UNMEASURED_AMP["battery_status"]), np.nan, -current)  # negative in BatteryState
-    return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
+    current_amp = np.where(
+        np.isin(current, UNMEASURED_AMP["battery_status"]), np.nan, -current
+    )  # negative in BatteryState
+    return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": current_amp}
 
 
 def _convert_px4_wheels(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
@@ -256,8 +258,8 @@ def _convert_ardupilot_imu(_log: Autopilot, _name: str, time_us: Ints, f: Column
 
 def _convert_ardupilot_battery(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     scale = 1.0 if f["Volt"].dtype.kind == "f" else 0.01  # before 2015 in hundredths
-    voltage, drawn = f["Volt"] * scale, f["Curr"] * -scale
-    return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": drawn}
+    voltage, current_amp = f["Volt"] * scale, f["Curr"] * -scale
+    return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": current_amp}
 
 
 def _convert_ardupilot_wheels(log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:

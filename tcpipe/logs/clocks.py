@@ -166,8 +166,8 @@ def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int
     counts = np.array(
         [np.bincount(((stamp_ns - zero) // STEP_NS).clip(0, size), minlength=size + 1) for stamp_ns in stamps]
     )
-    usual = np.array([np.median(count[count > 0]) for count in counts])
-    regular = counts[usual >= _FEWEST_IN_BIN] / usual[usual >= _FEWEST_IN_BIN, None]
+    medians = np.array([np.median(count[count > 0]) for count in counts])
+    regular = counts[medians >= _FEWEST_IN_BIN] / medians[medians >= _FEWEST_IN_BIN, None]
     if len(regular) < _FEWEST_REGULAR:
         return []
     twice = np.concatenate(
@@ -263,7 +263,7 @@ def _make_simulated_timeline(name: str, times: TopicTimes, clock: SimulatedClock
 
 
 def _find_simulated_problem(name: str, times: TopicTimes, clock: SimulatedClock) -> str | None:
-    """Return why a topic's header does not rule in a simulation, or None where it does."""
+    """Return the reason why a topic's header is not used in a simulation, or None if it is used."""
     if times.prefer == "log":
         return RECIPE
     if name not in clock.topics:
@@ -295,7 +295,7 @@ def _find_steps(times: TopicTimes) -> list[tuple[int, int]]:
         before, after = level[start:j], level[j : max(int(np.searchsorted(at, at[j] + _LASTING_NS)), j + _FEWEST)]
         low, high = np.median(before), np.median(after)
         step, middle = int(high - low), (low + high) / 2
-        # The very row must take the step (not one near it), and both levels must last: a delay comes back.
+        # The step must be exactly at the row, and both levels must last; a delay returns to the old level.
         takes_it = abs(int(level[j] - level[j - 1]) - step) < abs(step) // 2
         lasts = all(
             np.mean((side > middle) != (own > middle)) <= _MAX_OTHER_LEVEL_FRACTION
@@ -343,7 +343,7 @@ def _find_common_steps(log_times: Mapping[str, Ints], steps_of: Mapping[str, lis
 
 @dataclass(frozen=True, slots=True)
 class _Draft:
-    """A topic whose source of time is chosen, but not yet on the others' clock."""
+    """A topic with a chosen source of time, not yet converted to the common clock."""
 
     source: Literal["header", "log"]
     why: str
@@ -378,7 +378,7 @@ def _predict_stamps(times: TopicTimes, offset_ns: Mapping[int, int], epoch: Ints
 
 
 def _assign_epochs(name: str, times: TopicTimes, steps: Sequence[ClockStep], own: Sequence[tuple[int, int]]) -> Ints:
-    """Return each row's epoch: by its own topic's step where it has one, else by the step's log time."""
+    """Return each row's epoch: by the step of its own topic, or, without one, by the step's log time."""
     own_rows = {int(times.log_time_ns[row]): row for row, _ in own}
     epoch = np.zeros(len(times.log_time_ns), np.int64)
     for step in steps:
@@ -406,7 +406,7 @@ def _compute_offsets(times: TopicTimes, known: Mask, epoch: Ints) -> dict[int, i
 
 
 def _find_header_problem(times: TopicTimes, own_steps: Sequence[tuple[int, int]]) -> str | None:
-    """Return why a topic's log time rules, or None where its header does."""
+    """Return why a topic's log time rules, or None if its header does."""
     known = _is_set(times)
     if times.prefer == "log":
         return RECIPE
@@ -433,11 +433,11 @@ def _compute_stray_share(times: TopicTimes, known: Mask, own_steps: Sequence[tup
 def _compute_repeated_share(times: TopicTimes) -> float:
     if times.header_ns is None or len(times.header_ns) < 2 * _FEWEST:
         return 0.0
-    again = np.diff(times.header_ns) == 0
-    rows = np.flatnonzero(again)
+    is_repeated = np.diff(times.header_ns) == 0
+    rows = np.flatnonzero(is_repeated)
     other = [column[rows + 1].astype(float) - column[rows] != 0 for column in times.content]
-    again[rows] = np.any(other, axis=0)
-    return float(np.mean(again))
+    is_repeated[rows] = np.any(other, axis=0)
+    return float(np.mean(is_repeated))
 
 
 def _find_leaps(times: TopicTimes, known: Mask) -> Mask:
@@ -470,8 +470,8 @@ def _find_reference_offset(drafts: Mapping[str, _Draft], epoch: int) -> int:
 
 def _find_clock_shifts(times: TopicTimes, draft: _Draft, reference: Sequence[int]) -> list[int]:
     """Return the correction of a topic to the clock of the others [ns], by epoch."""
-    apart = [target - draft.offset_ns.get(epoch, 0) for epoch, target in enumerate(reference)]
-    return [move if abs(move) > APART_NS and times.prefer != "header" else 0 for move in apart]
+    shifts_ns = [target - draft.offset_ns.get(epoch, 0) for epoch, target in enumerate(reference)]
+    return [move if abs(move) > APART_NS and times.prefer != "header" else 0 for move in shifts_ns]
 
 
 def _make_timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> TopicTimeline:
@@ -517,7 +517,7 @@ def _compute_lateness(stamp_ns: Ints, epoch: Ints, usable: Mask) -> Ints:
 
 
 def find_simulated_clock(stamps: Mapping[str, tuple[Ints, Ints]], *, published: bool) -> SimulatedClock | None:
-    """Return the clock of the simulation that a log is of, None where it is of none.
+    """Return the clock of the simulation that a log is of, None if it is of none.
 
     ``stamps`` are by topic log times and header stamps [ns], shape (N,), 0 where unset; without a ``published`` /clock
     they must be no wall clock's.

@@ -48,8 +48,7 @@ Read = Callable[[str, int | None], Floats]
 """Returns a column's values, those of one element where it is a list."""
 
 FORM = 'a column, or numbers and columns joined by + - * / ( ), as "(velL + velR) / 2"; other names in backquotes, as "`Power (w)` * 2"'
-_LONGEST = 300
-"""Longest expression [characters]: it cannot nest deeper than the parser allows."""
+_LONGEST = 300  # longest expression [characters]: it cannot nest deeper than the parser allows
 _QUOTED = re.compile(r"`([^`]*)`")
 _MARK = "quoted_column_"
 _OPERATORS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide}
@@ -73,7 +72,7 @@ class Expression:
         return self.operands()[0][0] if is_one else None
 
     def operands(self) -> list[tuple[str, int | None]]:
-        """Return the columns that it reads, each with the element of its list, None where it is no list."""
+        """Return the columns that it reads, each with the element of its list, None if it is no list."""
         found: list[tuple[str, int | None]] = []
 
         def record(name: str, index: int | None) -> Floats:

@@ -72,7 +72,7 @@ def is_base(frame: str) -> bool:
 
 
 def find_base_link_from(frame: str, tree: Tree) -> Pose | None:
-    """Return base_link_from_frame by the shortest chain of static transforms, or None where no chain leads to a base.
+    """Return base_link_from_frame by the shortest chain of static transforms, or None if no chain leads to a base.
 
     base_link goes before base_footprint, and a base with the frame's own prefix before another's; base_footprint stands
     for base_link only where no base_link is connected.

@@ -221,8 +221,7 @@ def _choose_factor(unit: str, expression: Expression, name: str, units: Mapping[
     return 1.0 if factor is None else factor
 
 
-_CLEARLY_A_UNIT = 2
-"""Shortest unit at the end of a name [characters]: shorter ones may have another meaning."""
+_CLEARLY_A_UNIT = 2  # shortest unit at the end of a name [characters]: shorter ones may have another meaning
 
 
 def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, AnyArray]:
@@ -387,7 +386,7 @@ _LONGEST_BYTES, _MOST_NAMES = 1 << 16, 1000
 
 
 def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
-    """Return the name of each field of a role; {} where one is missing that the role needs."""
+    """Return the name of each field of a role; {} if one is missing that the role needs."""
     found = match_known_fields(role, names)
     return found if all(field in found for field, definition in MAPPED[role].items() if definition.needed) else {}
 

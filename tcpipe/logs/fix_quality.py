@@ -21,8 +21,7 @@ FIX_STD_M = {"rtk_fixed": 0.02, "rtk_float": 0.5, "differential": 1.0, "single":
 """Horizontal standard deviation of a fix by its quality [m], of a GGA sentence at HDOP 1."""
 _FIXED, _FLOAT, _DIFFERENTIAL, _SINGLE = range(4)
 _NO_FIX, _UNKNOWN = -1.0, np.nan
-_STATUS = np.array([2, 2, 1, 0, -1], np.int8)
-"""NavSatStatus by quality."""
+_STATUS = np.array([2, 2, 1, 0, -1], np.int8)  # NavSatStatus by quality
 
 CODES: dict[str, dict[int, float]] = {
     "gga": {1: _SINGLE, 2: _DIFFERENTIAL, 3: _SINGLE, 4: _FIXED, 5: _FLOAT, 9: _DIFFERENTIAL},

@@ -40,7 +40,7 @@ Arrays = dict[str, AnyArray]
 class Readings:
     """A topic's usable rows.
 
-    ``row`` is each one's place in the table, ``header_ns`` its own stamp (0 where unset, None where the type has none),
+    ``row`` is each one's place in the table, ``header_ns`` its own stamp (0 where unset, None if the type has none),
     ``dropped`` counts the rows that are not used by reason, ``notes`` counts values that were set aside inside used
     rows.
     """
@@ -83,8 +83,7 @@ def read_messages(
     return replace(found, columns=columns, notes=found.notes | ({"std_by_quality": count} if count else {}))
 
 
-_IMPOSSIBLE = 1e9
-"""Largest position, velocity or acceleration in SI units; squares of larger values overflow."""
+_IMPOSSIBLE = 1e9  # largest position, velocity or acceleration in SI units; squares of larger values overflow
 
 
 def _mask_impossible(name: str, values: AnyArray) -> AnyArray:
@@ -104,8 +103,8 @@ def count_frames(columns: Columns, type_name: str) -> dict[str, int]:
     if name not in columns or type_name in (roles.POSE_STAMPED, roles.POSE_WITH_COVARIANCE_STAMPED):
         return {}
     column = columns[name]
-    alike = column.size > 0 and column.strides[0] == 0
-    texts, counts = (column[:1], [column.size]) if alike else np.unique(column.astype(str), return_counts=True)
+    is_constant = column.size > 0 and column.strides[0] == 0
+    texts, counts = (column[:1], [column.size]) if is_constant else np.unique(column.astype(str), return_counts=True)
     found: dict[str, int] = {}
     for text, count in zip(texts, counts, strict=True):
         found[text.lstrip("/")] = found.get(text.lstrip("/"), 0) + int(count)
@@ -113,7 +112,7 @@ def count_frames(columns: Columns, type_name: str) -> dict[str, int]:
 
 
 def read_header_ns(columns: Columns) -> Ints | None:
-    """Return header stamps [ns], 0 where unset; None where the message has no header."""
+    """Return header stamps [ns], 0 where unset; None if the message has no header."""
     if _STAMP[0] not in columns:
         return None
     return columns[_STAMP[0]].astype(np.int64) * 1_000_000_000 + columns[_STAMP[1]].astype(np.int64)
@@ -374,8 +373,7 @@ def _read_gps_fix(columns: Columns) -> Readings:
     return _select_rows(columns, values, drops)
 
 
-_STDS_OF_95 = 2.0
-"""gps_common/GPSFix: errors are stated at 95 per cent confidence."""
+_STDS_OF_95 = 2.0  # gps_common/GPSFix: errors are stated at 95 per cent confidence
 
 
 def _read_velocity_twist(columns: Columns) -> Readings:

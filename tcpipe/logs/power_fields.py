@@ -63,7 +63,7 @@ def split_sides(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def match_power_fields(names: Iterable[str]) -> PowerFields | None:
-    """Return the voltage and current, or the power, among fields; None where neither a current nor a power is.
+    """Return the voltage and current, or the power, among fields; None if neither a current nor a power is.
 
     Fields whose names differ by sides or numbers alone belong together: each at its own voltage where there are as
     many, else added.
@@ -163,9 +163,9 @@ def _take_first_element(name: str) -> str:
     return name.replace("[]", "[0]")
 
 
-def _find_doubt(drawn: Sequence[_Named], others: Sequence[_Named]) -> str:
+def _find_doubt(chosen: Sequence[_Named], others: Sequence[_Named]) -> str:
     if others:
         return f"{', '.join(other.name for other in others)} could be meant as well"
-    if _rank(drawn)[:2] == (True, True):
+    if _rank(chosen)[:2] == (True, True):
         return "uncomment if these are drawn from the battery; currents of motor phases are larger"
     return ""

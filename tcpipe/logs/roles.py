@@ -62,7 +62,7 @@ ROLE_TYPES: dict[str, tuple[str, ...]] = {
     "command": (TWIST_STAMPED, TWIST),
     "pose": (POSE_WITH_COVARIANCE_STAMPED, ODOMETRY, POSE_STAMPED),
 }
-"""Message types that can play each role, best first; power has those of the profiles before these."""
+"""Message types for each role, best first; for power, types of profiles come before these."""
 
 MOTION_ROLES = ("wheel_odometry", "visual_odometry", "gnss", "pose")
 """Roles of which a log needs one."""
@@ -99,7 +99,7 @@ class RoleAssignment:
 
     @property
     def static_transforms(self) -> tuple[str, ...]:
-        """The topics of static transforms (those called so)."""
+        """The topics of static transforms, by name."""
         return tuple(topic for topic in self.transforms if topic.endswith("tf_static"))
 
 
@@ -148,9 +148,9 @@ def assign_roles(
     named after it while it has no messages; an empty list means that no topic is used. Outside ``namespace`` only
     topics that are chosen by name are used. Those of the ``mapped`` roles (``read.fields``) may be of any type.
     """
-    every = {topic.name: topic for topic in sorted(topics, key=lambda topic: topic.name)}
+    topics_by_name = {topic.name: topic for topic in sorted(topics, key=lambda topic: topic.name)}
     named = {name for names in chosen.values() for name in names}
-    listed = {name: topic for name, topic in every.items() if _is_in(namespace, topic) or name in named}
+    listed = {name: topic for name, topic in topics_by_name.items() if _is_in(namespace, topic) or name in named}
     wanted = {str(role): names for role, names in chosen.items()}
     name, robot_why = find_robot(listed.values(), robot, known.robots)
     types = {**ROLE_TYPES, "power": tuple(dict.fromkeys([*known.types(), *FLOAT_TYPES]))}
@@ -158,7 +158,7 @@ def assign_roles(
     decided = _Decisions(types, propulsion, known.refusals())
     if namespace is not None and not any(topic.type_name not in TRANSFORMS for topic in listed.values()):
         decided.problems.append(
-            f"recipe read.namespace: no topic below {namespace}; the log has {format_topics(every.values())}"
+            f"recipe read.namespace: no topic below {namespace}; the log has {format_topics(topics_by_name.values())}"
         )
     _take_chosen(decided, listed, wanted, mapped)
     taken = {name for role in decided.roles.values() for name in role.topics}
@@ -537,7 +537,7 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
 def _select_best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
     """Return the best-ranked candidates with their reasons, without those that cover little compared with another.
 
-    Of power all of a rank are taken, since sides are summed: one that fell silent is still a side.
+    Of power all of a rank are taken, since sides are summed, also a side without later messages.
     """
     topics = [topic for _, _, topic in candidates]
     thin = find_short_topics(topics, topics, of_power=role == "power")

@@ -27,7 +27,7 @@ class Topic:
     """One topic of a log, or of a file of it, by the index; None for values that the index lacks.
 
     ``type_name`` is ``package/msg/Name`` for ROS 1 and ROS 2 alike; ``encoding`` is ``cdr``, ``ros1``, or what else the
-    log names; ``definition`` is the definition text in the log ("" where it has none), of the language
+    log names; ``definition`` is the definition text in the log ("" if it has none), of the language
     ``schema_encoding``; ``problem`` is the reason why the topic cannot be read.
     """
 
@@ -145,9 +145,9 @@ LISTED = 8
 
 def format_topics(topics: Iterable[Topic], types: Sequence[str] | None = None) -> str:
     """Return topics as ``/name (type, n messages, rate)``, shortened if long; only those of ``types`` if any."""
-    every = list(topics)
-    of_type = [topic for topic in every if types is not None and topic.type_name in types]
-    chosen = of_type or every
+    all_topics = list(topics)
+    of_type = [topic for topic in all_topics if types is not None and topic.type_name in types]
+    chosen = of_type or all_topics
     shown = ", ".join(_describe_topic(topic) for topic in chosen[:LISTED])
     more = f", and {len(chosen) - LISTED} more" if len(chosen) > LISTED else ""
     return shown + more if chosen else "no topic at all"
@@ -179,8 +179,7 @@ def list_undecodable(topics: Iterable[Topic]) -> Iterator[str]:
         yield f"topics with data that cannot be decoded: {reasons}{more}"
 
 
-_LITTLE_SPAN = 0.5
-"""A sensor that was no messages for more than half of the drive does not win by its name."""
+_LITTLE_SPAN = 0.5  # A sensor that was no messages for more than half of the drive does not win by its name
 _LITTLE_SPAN_OF_POWER = 0.1
 """For power the coverage counts less, since topics measure propulsion or the whole battery: different quantities."""
 _SILENCE_NS, _SILENT_PERIODS = 5_000_000_000, 10

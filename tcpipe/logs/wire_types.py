@@ -57,7 +57,7 @@ WireType = Scalar | Text | Record | Array
 
 
 def count_leaves(wire_type: WireType) -> int:
-    """Return into how many columns the type unfolds; an array counts its element once."""
+    """Return the number of columns of the type; an array counts its element once."""
     match wire_type:
         case Record():
             return wire_type.leaves
@@ -158,8 +158,7 @@ def _parse_field_type(found: re.Match[str], owner: str) -> FieldType:
     return FieldType(name, limit, int(found["size"] or 0), fixed)
 
 
-_MAX_ELEMENTS = 20_000
-"""Most texts or irregular messages of a list: they are found one after the other [1]."""
+_MAX_ELEMENTS = 20_000  # most texts or irregular messages of a list: they are found one after the other [1]
 
 
 class LayoutError(ValueError):
@@ -189,7 +188,7 @@ CDR = Dialect(4, 8, 1, 1, 3)
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Places at equal distances: the first, and of each axis how many there are and how far apart."""
+    """Offsets at equal distances: the first, and the number and distance along each axis."""
 
     first: int
     shape: tuple[int, ...]
@@ -204,7 +203,7 @@ class Grid:
         return found.copy().reshape(-1).view(dtype)
 
     def list_offsets(self) -> Ints:
-        """Return all of them, the last axis first."""
+        """Return all offsets, the last axis first."""
         offsets = np.full(1, self.first, np.int64)
         for count, stride in zip(self.shape, self.strides, strict=True):
             offsets = (offsets[:, None] + stride * np.arange(count)).ravel()
@@ -391,7 +390,7 @@ class _Cursors:
         return found
 
     def take(self, rows: Ints, sizes: int | Ints, alignment: int | Ints) -> Places:
-        """Move over ``sizes`` bytes after alignment; return where they begin."""
+        """Skip ``sizes`` bytes after alignment; return the offset of their start."""
         if not len(rows):
             return rows
         mask = np.minimum(alignment, self._dialect.max_alignment) - 1

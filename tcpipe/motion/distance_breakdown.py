@@ -48,8 +48,8 @@ def compute_unexplained_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floa
     """
     step_s = np.diff(stamp_ns).astype(np.float64) * 1e-9
     explained = 0.5 * (velocity_mps[1:, :2] + velocity_mps[:-1, :2]) * step_s[:, None]
-    off = np.diff(position_m[:, :2], axis=0) - explained
-    return np.where(piece[:-1] == piece[1:], np.hypot(off[:, 0], off[:, 1]), 0.0)
+    difference = np.diff(position_m[:, :2], axis=0) - explained
+    return np.where(piece[:-1] == piece[1:], np.hypot(difference[:, 0], difference[:, 1]), 0.0)
 
 
 def compute_interval_length_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats, piece: Ints) -> Floats:

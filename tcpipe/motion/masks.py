@@ -20,7 +20,7 @@ from tcpipe.motion.row_sections import (
 
 
 def find_stuck(rows: MotionRows, *, stationary_velocity_mps: float, wheel_velocity_above_mps: float) -> Mask:
-    """Return rows where the wheels turn at a stationary ground speed; none where the wheel speed is unknown."""
+    """Return rows where the wheels turn at a stationary ground speed; none if the wheel speed is unknown."""
     turning_wheels = np.abs(np.nan_to_num(rows.wheel_velocity_mps)) > wheel_velocity_above_mps
     return turning_wheels & (np.abs(rows.velocity_mps) < stationary_velocity_mps)
 
@@ -122,9 +122,9 @@ def _estimate_jitter(command: Floats, part: Ints, window: int) -> Floats:
 
 def _find_moment(command: Floats, before_mps: float, after_mps: float, *, step_mps: float) -> tuple[int, int]:
     """Return the first row that leaves the old value, and the first that stays at the new one, in a change."""
-    left = np.flatnonzero(np.abs(command - before_mps) > step_mps)
+    changed = np.flatnonzero(np.abs(command - before_mps) > step_mps)
     unreached = np.flatnonzero(np.abs(command - after_mps) > step_mps)
-    begin = int(left[0]) if len(left) else 0
+    begin = int(changed[0]) if len(changed) else 0
     return begin, max(begin, int(unreached[-1]) + 1 if len(unreached) else 0)
 
 
@@ -133,8 +133,8 @@ def find_below_full_speed(rows: MotionRows, *, limit_mps: float, window_s: float
     part, command = _select_known_command(rows)
     speed = np.abs(command)
     half = rows.count(window_s / 2)
-    settled = compute_window_mean(speed, part, before=half, after=half)
-    return np.isfinite(rows.commanded_mps) & (speed < limit_mps) & (settled < limit_mps)
+    mean_command = compute_window_mean(speed, part, before=half, after=half)
+    return np.isfinite(rows.commanded_mps) & (speed < limit_mps) & (mean_command < limit_mps)
 
 
 def find_top_command(
@@ -147,12 +147,12 @@ def find_top_command(
     """
     part, command = _select_known_command(rows)
     half = rows.count(window_s / 2)
-    settled = compute_window_mean(np.abs(command), part, before=half, after=half)
+    mean_command = compute_window_mean(np.abs(command), part, before=half, after=half)
     moving = np.isfinite(rows.commanded_mps) & (np.abs(rows.velocity_mps) > moving_above_mps)
     if not moving.any():
         return 0.0, 0.0
-    top = float(np.quantile(settled[moving], 0.99))
-    return top, float(np.mean(settled[moving] >= share_of_top * top))
+    top = float(np.quantile(mean_command[moving], 0.99))
+    return top, float(np.mean(mean_command[moving] >= share_of_top * top))
 
 
 def _select_known_command(rows: MotionRows) -> tuple[Ints, Floats]:

@@ -1,4 +1,4 @@
-"""Judge the uncertainty of a run: withhold fixes in windows, fuse the rest, and compare the track with them."""
+"""Audit the uncertainty of a run: withhold fixes, fuse the other data, and compare the track with the fixes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -175,9 +175,9 @@ class WithheldComparisons:
 
 
 def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> WithheldComparisons:
-    """Withhold fixes in windows of each length, and compare them with the track of the rest.
+    """Withhold fixes in windows of each length, and compare them with the track from the other data.
 
-    All windows of a length are withheld together, so that a length costs one fusion.
+    All windows of a length are withheld together, so that each length needs only one fusion.
 
     Raises `FusionError`: no sensor measures motion.
     """
@@ -320,7 +320,7 @@ def audit(
 ) -> Audit:
     """Withhold fixes in windows, fuse the other data, and compare the track with the withheld fixes.
 
-    Raises `UsageError`: the run is too short, or has no sensor beside the one that would be withheld; `LogError`,
+    Raises `UsageError`: the run is too short, or has no sensor other than the one to be withheld; `LogError`,
     `RecipeError`, `StoreError`, `FusionError`: it cannot be read or fused.
 
     Parameters

@@ -153,12 +153,12 @@ def record_call(
     """
     begin_s, cpu_s = time.monotonic(), _read_cpu_s()
     names = [name for file in store.place.list("calls") if (name := parse_name("calls", file)) is not None]
-    turn = 1 + max((int(name.key[:8], 16) for name in names), default=0)
+    number = 1 + max((int(name.key[:8], 16) for name in names), default=0)
     call = Call(
         command=command, version=__version__, works_on=tuple(works_on), options=to_plain(options or {}),
         process=identify_process(), begin=datetime.now(UTC).isoformat(timespec="milliseconds"), jobs=jobs,
     )  # fmt: skip
-    running = RunningCall(store, State(), f"{turn:08x}{secrets.token_hex(4)}", call)
+    running = RunningCall(store, State(), f"{number:08x}{secrets.token_hex(4)}", call)
 
     def end() -> None:
         took = {"wall_s": round(time.monotonic() - begin_s, 3), "cpu_s": round(_read_cpu_s() - cpu_s, 3)}
@@ -221,7 +221,7 @@ INGEST, BUILD, ADD_MAP, PRUNE, ACKNOWLEDGE = "ingest", "build-dataset", "add-map
 
 
 def format_duration(seconds: float) -> str:
-    """Return a duration in words."""
+    """Return a duration as text."""
     for unit, size in (("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {unit}"
@@ -229,7 +229,7 @@ def format_duration(seconds: float) -> str:
 
 
 def format_bytes(count: float) -> str:
-    """Return a size in words."""
+    """Return a size as text."""
     for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= size:
             return f"{count / size:.3g} {unit}"

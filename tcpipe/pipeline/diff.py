@@ -69,11 +69,11 @@ def diff(a: Location, b: Location) -> Difference:
     """Compare two datasets; `DatasetError` if either is no dataset."""
     first, second = fetch_directory(a), fetch_directory(b)
     cards = read_card(first), read_card(second)
-    there = [sample_columns(directory) for directory in (first, second)]
-    shared = [name for name in there[0] if name in there[1]]
+    columns = [sample_columns(directory) for directory in (first, second)]
+    shared = [name for name in columns[0] if name in columns[1]]
     tables = tuple(read_samples(directory, ["sample_id", "split", *_LABELS]) for directory in (first, second))
     at = pc.index_in(tables[0].column("sample_id"), value_set=tables[1].column("sample_id").combine_chunks())
-    row = at.to_numpy(zero_copy_only=False)  # of b for each of a, NaN where it is not there
+    row = at.to_numpy(zero_copy_only=False)  # value of b for each of a, NaN if it is missing
     in_a = np.flatnonzero(np.isfinite(row))
     in_b = row[in_a].astype(np.int64)
     both = ((first, in_a), (second, in_b))
@@ -125,8 +125,8 @@ def diff(a: Location, b: Location) -> Difference:
 
 def _find_all(card: DatasetCard) -> dict[tuple[str, str, Subject], Finding]:
     """Return every finding of a dataset by its run or map, its code and its subject."""
-    every = [("", card.findings), *card.findings_by_run.items(), *card.findings_by_map.items()]
-    return {(where, finding.code, finding.subject): finding for where, findings in every for finding in findings}
+    groups = [("", card.findings), *card.findings_by_run.items(), *card.findings_by_map.items()]
+    return {(where, finding.code, finding.subject): finding for where, findings in groups for finding in findings}
 
 
 def _read_values(table: pa.Table, name: str) -> Floats:

@@ -43,7 +43,7 @@ class ExportOrigin:
 
 @dataclass(frozen=True, slots=True)
 class IndexEntry:
-    """A topic's file; None where the topic cannot be read."""
+    """A topic's file; None if the topic cannot be read."""
 
     file: str | None
     bytes: int
@@ -147,11 +147,11 @@ def _select_topics(log: AnyLog, log_path: str, topics: Sequence[str]) -> list[st
     parts = (part.strip() for text in topics for part in ([text] if text in log.topics else text.split(",")))
     split = list(dict.fromkeys(part for part in parts if part))
     missing = [name for name in split if name not in log.topics]
-    there = ", ".join(sorted(log.topics)) or "none"
+    known_topics = ", ".join(sorted(log.topics)) or "none"
     if missing:
-        raise LogError(*(f"{log_path}: topic {name} is not in this log; there are: {there}" for name in missing))
+        raise LogError(*(f"{log_path}: topic {name} is not in this log; there are: {known_topics}" for name in missing))
     if topics and not split:
-        raise LogError(f"{log_path}: no topic is named; there are: {there}")
+        raise LogError(f"{log_path}: no topic is named; there are: {known_topics}")
     return split or sorted(log.topics)
 
 
@@ -168,8 +168,8 @@ def _refuse_what_is_ours(out: Path) -> None:
     signs = {
         "dataset": "dataset.json", "map": "zarr.json", "model": "model.json", "cost map": "cost-map.json",
     }  # fmt: skip
-    ours = "store" if is_store(out) else None
-    kind = ours or next((kind for kind, sign in signs.items() if (out / sign).is_file()), None)
+    kind_of_output = "store" if is_store(out) else None
+    kind = kind_of_output or next((kind for kind, sign in signs.items() if (out / sign).is_file()), None)
     if kind:
         raise UsageError(f"{out}: is a {kind}; give another directory for the topics")
 
@@ -182,9 +182,9 @@ def _refuse_others_files(index: ExportIndex | None, made_from: ExportOrigin, pat
         if index.made_from.log != made_from.log:
             out = next(iter(paths.values())).parent
             raise UsageError(f"{out}: contains topics of {index.made_from.log}; give another directory")
-    strange = [path for path in paths.values() if path.exists() and path.name not in known and not _is_a_topics(path)]
-    if strange:
-        raise UsageError(*(f"{path}: exists and is not an exported topic; give another directory" for path in strange))
+    foreign = [path for path in paths.values() if path.exists() and path.name not in known and not _is_a_topics(path)]
+    if foreign:
+        raise UsageError(*(f"{path}: exists and is not an exported topic; give another directory" for path in foreign))
 
 
 def _is_a_topics(path: Path) -> bool:

@@ -96,7 +96,7 @@ class SummaryLine:
     recipe: str
     """The file that rules, or that it is the defaults."""
     store: str | None
-    """None where no store was made."""
+    """None if no store was made."""
     exit_code: int
     transient: bool
     """Whether a log failed for a reason that may pass: the same call may succeed later."""
@@ -188,10 +188,10 @@ def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path, *, is_
 def _announce_new_results(steps: Sequence[PlannedLog], state: State) -> None:
     """Log how many runs are made again because this version of tcpipe gives other results."""
     contents = {row.log.sha256 for row in state.runs.values() if row.results_version != RESULTS_VERSION}
-    again = [step for step in steps if step.state == "outdated" and step.task.source.sha256 in contents]
-    if again:
+    outdated = [step for step in steps if step.state == "outdated" and step.task.source.sha256 in contents]
+    if outdated:
         text = "tcpipe %s gives other results (version %d): %d runs are made again"
-        logger.warning(text, __version__, RESULTS_VERSION, len(again))
+        logger.warning(text, __version__, RESULTS_VERSION, len(outdated))
 
 
 _MOST_RUNS = 5  # named in one message
@@ -243,10 +243,10 @@ def _iterate_results(
 ) -> Iterator[tuple[int, IngestResult]]:
     """Yield the result of each log with its index, when it ends."""
     known = {problem.key for row in call.state.runs.values() for problem in find_problems(row)}
-    for turn in iterate_rounds(steps):
-        with closing(run_all(ingest_one, [task for _, task in turn], jobs=jobs, cluster=cluster)) as outcomes:
+    for round_ in iterate_rounds(steps):
+        with closing(run_all(ingest_one, [task for _, task in round_], jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
-                index, task = turn[outcome.index]
+                index, task = round_[outcome.index]
                 ended = outcome.result or Ingested(task.source, make_died_result(task.source))
                 yield index, _record_result(call, task, ended, known)
 
@@ -263,9 +263,9 @@ def _record_result(call: RunningCall, task: IngestTask, ended: Ingested, known: 
             failure = LogFailure(content, source.origins, result.problems, __version__, result.findings)
             call.store.put(state, "failed", task.failure_key, failure)
         if result.sha256 and source.files and result.status != "waiting":
-            seen = LogSnapshot(source.origins, source.files, result.sha256)
-            if state.find_seen(source.origins) != seen:
-                call.store.put(state, "seen", make_key(find_lineage(source.origins)), seen)
+            snapshot = LogSnapshot(source.origins, source.files, result.sha256)
+            if state.find_seen(source.origins) != snapshot:
+                call.store.put(state, "seen", make_key(find_lineage(source.origins)), snapshot)
     except StoreError as error:
         logger.error("%s", error)
     if result.status == "failed":

@@ -36,7 +36,7 @@ _TIMES = 2  # columns before the message's own: both times of the log
 
 @dataclass(frozen=True, slots=True)
 class StampCounts:
-    """Counts over all messages of a topic; those of stamps are None where its messages have no header."""
+    """Counts over all messages of a topic; those of stamps are None if its messages have no header."""
 
     messages_read: int
     longest_gap_s: float | None

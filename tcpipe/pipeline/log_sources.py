@@ -43,7 +43,7 @@ class LogSource:
     paths: tuple[Path, ...]
     files: tuple[tuple[int, int], ...]
     sha256: str | None = None
-    """None where it has yet to be computed."""
+    """None if it has yet to be computed."""
     urls: tuple[str, ...] = ()
     """Locations of the files, if one is in object storage; ``paths`` are then placeholders of equal names and sizes."""
     queries: tuple[str, ...] = field(default=(), repr=False)
@@ -200,7 +200,7 @@ def select_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[i
 
 
 def make_definitions_key(directory: Path | None) -> str:
-    """Return a short hash of the definition files that the user gives; "" where none are given."""
+    """Return a short hash of the definition files that the user gives; "" if none are given."""
     if directory is None:
         return ""
     digest = hashlib.sha256()
@@ -234,7 +234,7 @@ def _place_in(path: Path, entry: Path) -> str:
 
 
 def _list_file_states(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
-    return tuple((seen.st_size, seen.st_mtime_ns) for path in paths for seen in _stat_files(path))
+    return tuple((status.st_size, status.st_mtime_ns) for path in paths for status in _stat_files(path))
 
 
 def _stat_files(path: Path) -> list[os.stat_result]:
@@ -244,7 +244,7 @@ def _stat_files(path: Path) -> list[os.stat_result]:
     except OSError:
         return []
     if stat.S_ISDIR(seen.st_mode):
-        names = (f"{place}/{name}" for place, _, held in walk_folders(path) for name in held)
+        names = (f"{place}/{name}" for place, _, names_in_folder in walk_folders(path) for name in names_in_folder)
         return [status for file in sorted(names) if stat.S_ISREG((status := os.stat(file)).st_mode)]  # noqa: PTH116
     return [seen] if stat.S_ISREG(seen.st_mode) else []
 

@@ -91,7 +91,7 @@ def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
             terrain=files.get("terrain", ()),
             more=more,
             classes=files["classes"][0] if "classes" in files else None,
-            agreed=_agree_classes(store, state, name),
+            agreed=_find_common_classes(store, state, name),
             crs=options.crs,
             inputs=inputs,
         )
@@ -217,7 +217,7 @@ def _describe_change(role: str, before: Mapping[str, str], now: Mapping[str, str
     return f"{role} has another content ({', '.join(names or before)})"
 
 
-def _agree_classes(store: Store, state: State, name: str) -> ClassScheme | None:
+def _find_common_classes(store: Store, state: State, name: str) -> ClassScheme | None:
     """Return the classes of the store's other maps; None if none of them has classes named by a user or a raster."""
     for other, record in state.maps.items():
         if other == name:
@@ -228,7 +228,7 @@ def _agree_classes(store: Store, state: State, name: str) -> ClassScheme | None:
             logger.warning("map %s cannot be read; its classes are not compared", other)
             continue
         if found.facts.classes_from == "file" or ("terrain" in found.layers and found.facts.classes_from != "default"):
-            own = found.facts.classes_from == "names"  # those values are of that raster alone
+            own = found.facts.classes_from == "names"  # the values belong to that raster alone
             values = {entry.id: entry.id for entry in found.classes.classes} if own else found.id_by_value
             return ClassScheme(found.classes, values)
     return None

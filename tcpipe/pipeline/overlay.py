@@ -58,8 +58,10 @@ class Overlay:
 
     def __str__(self) -> str:
         """Return the file and its topics, a line each."""
-        said = (f"{count:>9} messages  {topic}" for topic, count in self.messages.items())
-        return clean_lines((f"{self.path}: run {self.run_id} under recipe {self.recipe_id}, on its log's clock", *said))
+        lines = (f"{count:>9} messages  {topic}" for topic, count in self.messages.items())
+        return clean_lines(
+            (f"{self.path}: run {self.run_id} under recipe {self.recipe_id}, on its log's clock", *lines)
+        )
 
 
 def write_overlay(name: str, out: Path, *, store: Location = "tcpipe-store") -> Overlay:
@@ -82,12 +84,12 @@ def write_overlay(name: str, out: Path, *, store: Location = "tcpipe-store") -> 
 
 
 def _refuse_others(out: Path) -> None:
-    mine = not out.exists()
+    is_own = not out.exists()
     with suppress(LogError):
-        if not mine:
+        if not is_own:
             with open_log(out) as log:
-                mine = all(name.startswith(OVERLAY) for name in log.topics)
-    if not mine:
+                is_own = all(name.startswith(OVERLAY) for name in log.topics)
+    if not is_own:
         raise UsageError(f"{out}: exists and is not an overlay; give another name")
 
 

@@ -43,7 +43,7 @@ class IngestTask:
     min_age_s: float = 0.0
 
     def is_made_by(self, made: RunFacts) -> bool:
-        """Return whether a run of this content is as a new one would be; each version reads damaged logs again."""
+        """Return whether a run is up to date; each version reads damaged logs again."""
         same_robot = made.robot_requested == self.robot or (self.robot is not None and made.robot == self.robot)
         same_version = (made.data_model_version, made.results_version) == (DATA_MODEL_VERSION, RESULTS_VERSION)
         same_version &= made.tcpipe_version == __version__ or not made.damage
@@ -83,7 +83,7 @@ class IngestResult:
     acknowledged: bool = False
     """Whether a person has acknowledged its problem (`tcpipe acknowledge`)."""
     traceback: str | None = None
-    """Where an internal error comes from."""
+    """Origin of an internal error."""
 
     @property
     def findings(self) -> Findings:
@@ -113,7 +113,7 @@ def make_result(source: LogSource, status: Status, made: RunFacts, sha256: str, 
 
 
 def check_age(task: IngestTask, now_ns: int | None = None) -> IngestResult | None:
-    """Return that a log has to wait, None where it has not."""
+    """Return the result that a log has to wait; None if it has not."""
     youngest_ns = max((time_ns for _, time_ns in task.source.files), default=0)
     age_s = ((time.time_ns() if now_ns is None else now_ns) - youngest_ns) / 1e9
     if not task.source.files or age_s >= task.min_age_s or not task.min_age_s:
@@ -187,9 +187,9 @@ class PlannedLog:
     state: LogState
     cause: str = ""
     made: RunFacts | None = None
-    """The ingestion of the log as it would be made now, where there is one."""
+    """The existing ingestion of the log with the current settings, if any."""
     failure: LogFailure | None = None
-    """Why the log is not tried again."""
+    """Reason why the log is not tried again."""
     findings: Findings = ()
     """Findings on its problems."""
 

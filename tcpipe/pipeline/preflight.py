@@ -129,21 +129,21 @@ class Preflight:
 
     def __str__(self) -> str:
         """Return it as lines."""
-        said = [
+        lines = [
             f"{self.log}: robot {self.robot or 'unknown'}",
             *(self.expected_yield.lines() if self.expected_yield else ()),
         ]
         for topic in self.topics:
             rate = "" if topic.rate_hz is None else f" at {topic.rate_hz:.3g} Hz"
             wanted = "" if topic.wanted_hz is None else f" (needed {topic.wanted_hz:g})"
-            said.append(f"topic     {topic.role}: {topic.topic}{rate}{wanted}")
-        said += [f"fails     {line}" for line in self.problems]
+            lines.append(f"topic     {topic.role}: {topic.topic}{rate}{wanted}")
+        lines += [f"fails     {line}" for line in self.problems]
         if self.expected_yield:
-            said += [f"verdict   {line}" for line in list_verdict(self.verdict)] + describe_power(self.verdict)
-        said += format_findings(self.findings, more=f"tcpipe preflight {shlex.quote(self.log)} --json")
-        said += [f"loss      {format_loss(loss)}" for loss in self.losses]
-        said += ["ready: no problems found"] if self.exit_code == 0 else []
-        return clean_lines([*said, "", *self.recipe.splitlines()])
+            lines += [f"verdict   {line}" for line in list_verdict(self.verdict)] + describe_power(self.verdict)
+        lines += format_findings(self.findings, more=f"tcpipe preflight {shlex.quote(self.log)} --json")
+        lines += [f"loss      {format_loss(loss)}" for loss in self.losses]
+        lines += ["ready: no problems found"] if self.exit_code == 0 else []
+        return clean_lines([*lines, "", *self.recipe.splitlines()])
 
 
 def preflight(
@@ -165,7 +165,7 @@ def preflight(
     if isinstance(path, Path) and path.is_dir():
         path = find_logs_at(path, recipe.tables)[0][0]
     with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as found:
-        seen = replace(inspect_log(found, recipe, robot, full=False, reads_roles=True), path=format_path(log))
+        inspected = replace(inspect_log(found, recipe, robot, full=False, reads_roles=True), path=format_path(log))
         read = find_read_config(recipe, found.topics)
         roles = decide_roles(read, found.topics.values(), robot, known=load_profiles(recipe)).roles
         missing = tuple(find_missing(roles, read))
@@ -175,17 +175,17 @@ def preflight(
             labelled = run_stages(streams, recipe.ingest, run_id="preflight")[2]
         except TcpipeError as error:
             problems, causes = error.problems, error.findings
-    return _summarize(seen, labelled, (*missing, *causes), problems)
+    return _summarize(inspected, labelled, (*missing, *causes), problems)
 
 
 def _summarize(
-    seen: InspectedLog, labelled: LabelledSegments | None, missing: Findings, problems: tuple[str, ...]
+    inspected: InspectedLog, labelled: LabelledSegments | None, missing: Findings, problems: tuple[str, ...]
 ) -> Preflight:
     report = labelled.info.report if labelled else NOTHING_FOUND
     expected_yield = _estimate_yield(labelled) if labelled else None
-    topics = tuple(_iterate_topics(report.facts, seen.duration_s or 0.0))
-    findings = [*missing, *find_slow(topics, expected_yield, seen.duration_s or 0.0)]
-    for more in (seen.findings or (), report.findings):
+    topics = tuple(_iterate_topics(report.facts, inspected.duration_s or 0.0))
+    findings = [*missing, *find_slow(topics, expected_yield, inspected.duration_s or 0.0)]
+    for more in (inspected.findings or (), report.findings):
         made = {(finding.code, finding.subject) for finding in findings}
         findings += [finding for finding in more if (finding.code, finding.subject) not in made]
     losses = find_largest_losses([expected_yield.distance_by_reason_m] if expected_yield else [])
@@ -195,15 +195,15 @@ def _summarize(
         and all(finding.severity == "note" for finding in findings)
     )
     return Preflight(
-        log=seen.path,
-        robot=seen.robot,
+        log=inspected.path,
+        robot=inspected.robot,
         expected_yield=expected_yield,
         topics=topics,
         problems=problems,
         findings=tuple(sort_findings(findings)),
         verdict=judge(findings),
         losses=tuple(loss for loss in losses if loss.share > _MIN_SHARE)[:_MOST_LOSSES],
-        recipe=seen.recipe or "",
+        recipe=inspected.recipe or "",
         exit_code=0 if ready else 3 if expected_yield else 1,
     )
 

@@ -87,9 +87,9 @@ class ProposedRecipe:
     def describe_next_step(self, path: Path) -> str:
         """Return the remaining steps for a recipe at a path."""
         decisions = sum(not line.is_certain for line in self.lines)
-        left = f"{decisions} comments in it are yours to decide; " if decisions else ""
+        decisions_text = f"{decisions} comments in it are yours to decide; " if decisions else ""
         stated = "" if path.parent.resolve() == Path.cwd() else f" --recipe {shlex.quote(str(path))}"
-        return f"{left}then: tcpipe preflight {shlex.quote(self.log)}{stated}"
+        return f"{decisions_text}then: tcpipe preflight {shlex.quote(self.log)}{stated}"
 
     def toml(self) -> str:
         """Return the text of the recipe file; the head of a table is a comment if all its lines are."""
@@ -314,12 +314,12 @@ def propose_tables(path: Path) -> ProposedRecipe:
         what = f"{path}: it contains no log, and no table with stamps and columns of known names"
         raise UsageError(what, *filter(None, head))
     reference = max(next(iter(roles.values())), key=lambda candidate: candidate[0].clock.count_stamps())[0]
-    lines, log, used, apart = list[ProposedLine](), path, set[str](), dict[str, _Table]()
+    lines, log, used, separate = list[ProposedLine](), path, set[str](), dict[str, _Table]()
     for role, candidates in roles.items():
         candidates.sort(key=lambda candidate: (-candidate[0].overlap_ns(reference), -candidate[0].clock.count_stamps()))
         table, mine = candidates[0]
         if not table.overlap_ns(reference):
-            apart[role] = table
+            separate[role] = table
         lines += mine
         used |= {line.value for line in mine if isinstance(line.value, str)}
         log = table.path if "*" in table.file else log
@@ -328,7 +328,7 @@ def propose_tables(path: Path) -> ProposedRecipe:
     needless = [line for line in lines if line.key == "stamp_zone"][1:]
     needless += [line for line in lines if line.note == NO_VOLTAGE and make_rail_name(line.table) in rails]
     lines = [line for line in lines if line not in needless]
-    lines, unaligned = _align_clocks(lines, log, apart, reference) if len(tables) > 1 else (lines, [])
+    lines, unaligned = _align_clocks(lines, log, separate, reference) if len(tables) > 1 else (lines, [])
     lines = _try_lines(lines, log, dict.fromkeys(unaligned, _UNALIGNED))
     found_roles = {*roles, *(line.value for line in lines if line.key == "role")}
     for role in ("gnss", "imu", "wheel_odometry", "power"):
@@ -495,32 +495,32 @@ _UNALIGNED = "no time in common with the others: another clock, or another drive
 
 
 def _align_clocks(
-    lines: Sequence[ProposedLine], log: Path, apart: Mapping[str, _Table], reference: _Table
+    lines: Sequence[ProposedLine], log: Path, separate: Mapping[str, _Table], reference: _Table
 ) -> tuple[list[ProposedLine], list[str]]:
     """Return the lines with the offsets of tables on another clock, and the names of tables whose offsets are unknown.
 
-    Offsets are found by speed and turn rate. The tables ``apart`` have no time in common with the reference: their
-    offsets are searched up to five minutes around the one at which both tables begin together. A table without motion
-    has the clock of a table with which it has time in common.
+    Offsets are found by speed and turn rate. The tables ``separate`` have no time in common with the reference: their
+    offsets are searched up to five minutes around the offset at which both tables begin at the same time. A table
+    without motion has the clock of a table with which it has time in common.
     """
     from tcpipe.stages.fuse_clocks import find_late_sensors  # noqa: PLC0415  kernels load only where there is work
 
-    begin_s = {name: (reference.span_ns[0] - table.span_ns[0]) / 1e9 for name, table in apart.items()}
-    together = [ProposedLine(f"tables.{name}", "offset_s", each) for name, each in begin_s.items()]
+    begin_s = {name: (reference.span_ns[0] - table.span_ns[0]) / 1e9 for name, table in separate.items()}
+    same_start = [ProposedLine(f"tables.{name}", "offset_s", each) for name, each in begin_s.items()]
     offset_s = dict[str, float]()
     with suppress(TcpipeError):
-        recipe = _make_recipe([*lines, *together])
+        recipe = _make_recipe([*lines, *same_start])
         late_s = find_late_sensors(_read_streams(log, recipe), recipe.fuse)
         offset_s = {name: round(begin_s.get(name, 0.0) - each, 2) for name, each in late_s.items()}
-    for name, table in apart.items():
-        clocks = [each for other, each in offset_s.items() if other in apart and apart[other].overlap_ns(table)]
+    for name, table in separate.items():
+        clocks = [each for other, each in offset_s.items() if other in separate and separate[other].overlap_ns(table)]
         offset_s |= {name: clocks[0]} if name not in offset_s and clocks else {}
     aligned = [
         ProposedLine(f"tables.{name}", "offset_s", each, "aligned by speed and turns")
         for name, each in offset_s.items()
-        if name in apart or abs(each) > 1.0  # fusing corrects less
+        if name in separate or abs(each) > 1.0  # fusing corrects less
     ]
-    return [*lines, *aligned], [name for name in apart if name not in offset_s]
+    return [*lines, *aligned], [name for name in separate if name not in offset_s]
 
 
 def _make_recipe(lines: Sequence[ProposedLine]) -> Recipe:

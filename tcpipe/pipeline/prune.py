@@ -88,7 +88,7 @@ def prune(
     names it. With ``dry_run`` nothing changes.
     """
     ruling, opened = ingest_key(resolve_recipe(recipe)), open_store(store)
-    forgotten, left = [make_absolute(name) for name in forget], _find_temporaries(opened)
+    forgotten, temporaries = [make_absolute(name) for name in forget], _find_temporaries(opened)
     with nullcontext() if dry_run else record_call(opened, PRUNE, runs, {"forget": forgotten}) as call:
         first, mine = (opened.scan(), "") if call is None else (call.state, call.key)
         if unknown := [name for name in forgotten if name not in first.outputs]:
@@ -106,7 +106,7 @@ def prune(
             if waits_for is None:
                 removal.choose_documents(second)
                 removal.choose_payload(second, payload)
-                removal.removed += left
+                removal.removed += temporaries
                 removal.execute()
         found = removal.describe(waits_for)
         if call is not None:
@@ -141,9 +141,9 @@ def _choose_named(store: Store, state: State, names: Sequence[str]) -> _Chosen:
 
 def _choose_replaced(state: State, ruling: str) -> _Chosen:
     """Return the runs that another supersedes, and those under an old recipe; the other run has its tables."""
-    there = [row for row in state.list_rows() if row.blob and state.has_payload(row)]
-    names = {(row.run_id, row.ingest_key) for row in there}
-    logs = {row.log.sha256 for row in there if row.ingest_key == ruling}
+    rows_with_payload = [row for row in state.list_rows() if row.blob and state.has_payload(row)]
+    names = {(row.run_id, row.ingest_key) for row in rows_with_payload}
+    logs = {row.log.sha256 for row in rows_with_payload if row.ingest_key == ruling}
     chosen: _Chosen = {}
     for row in state.list_rows():
         if row.blob and (row.superseded_by, row.ingest_key) in names:
@@ -228,7 +228,7 @@ class _Removal:
     def choose_documents(self, second: State) -> None:
         """Choose the documents that did not count in the first scan, then old calls and forgotten outputs."""
         counting = {*second.names.values()} - ({*self.earlier.values()} if self.dry_run else set())
-        replaced = dict.fromkeys([*self.first.beaten, *self.earlier.values()])
+        replaced = dict.fromkeys([*self.first.replaced, *self.earlier.values()])
         self.documents.append([name for name in replaced if name not in counting])
         last = [self.first.names["calls", key] for key in _find_old_calls(self.first)]
         last += [self.first.names["outputs", make_key(where)] for where in self.forgotten]

@@ -79,8 +79,8 @@ class Status:
 
     def __str__(self) -> str:
         """Return the lines as one text."""
-        said = ", ".join(f"{count} {_format_words(state)}" for state, count in self.counts.items()) or "no logs"
-        lines = [self.to_do_now, f"{self.store}: {said}", *(str(group) for group in self.groups)]
+        counts_text = ", ".join(f"{count} {_format_words(state)}" for state, count in self.counts.items()) or "no logs"
+        lines = [self.to_do_now, f"{self.store}: {counts_text}", *(str(group) for group in self.groups)]
         lines += [f"of earlier calls: {line}" for line in self.gone]
         lines += [f"{self.superseded_runs} superseded runs"] if self.superseded_runs else []
         lines += [f"{call.state}: {call}" for call in self.open_calls if call.state != "killed"]
@@ -161,16 +161,16 @@ def _find_tasks(
     calls = dict(asked.values())
     groups = [(logs, options)] if logs else []
     for works_on, how in [] if logs else calls.items():
-        mine = [log for log in works_on if asked[log][0] == works_on]
+        own_logs = [log for log in works_on if asked[log][0] == works_on]
         robot = options.robot or how.robot
-        again = replace(options, robot=robot, as_one=how.as_one, msgdef=how.message_definitions)
-        groups.append((mine, again))
+        same_options = replace(options, robot=robot, as_one=how.as_one, msgdef=how.message_definitions)
+        groups.append((own_logs, same_options))
     tasks, missing = list[IngestTask](), dict[str, tuple[str, ...]]()
-    for mine, again in groups:
+    for own_logs, same_options in groups:
         with make_scratch_directory() as staging:
-            found = list_log_sources(mine, as_one=again.as_one, staging=staging, tables=recipe.tables)
+            found = list_log_sources(own_logs, as_one=same_options.as_one, staging=staging, tables=recipe.tables)
         missing |= found.problems
-        new = make_tasks(found.sources, again, root, recipe)
+        new = make_tasks(found.sources, same_options, root, recipe)
         new = new if options.shard is None else [new[at] for at in select_shard(found.sources, options.shard)]
         known = {task.source.origins for task in tasks}  # of later calls
         tasks += [task for task in new if task.source.origins not in known]
@@ -200,11 +200,11 @@ def _iterate_groups(steps: Iterable[PlannedLog]) -> Iterator[Group]:
     """Yield logs of one state with findings of equal codes and subjects; without findings, of equal cause."""
     groups: dict[tuple[LogState, Hashable], list[PlannedLog]] = {}
     for step in steps:
-        alike = frozenset(
+        with_equal_remedy = frozenset(
             (finding.code, None if finding.subject.kind in ("log", "run") else finding.subject)
             for finding in step.findings
         )
-        groups.setdefault((step.state, alike or step.cause), []).append(step)
+        groups.setdefault((step.state, with_equal_remedy or step.cause), []).append(step)
     for (state, _), group in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
         causes = list(dict.fromkeys(step.cause for step in group))
         cause = causes[0] if len(causes) == 1 else f"{len(causes)} reasons, the first: {causes[0]}"
@@ -222,7 +222,7 @@ def _format_words(state: LogState) -> str:
 
 def _format_call(call: Call) -> str:
     """Return a call as one line."""
-    said = ", ".join(f"{count} {what}" for what, count in call.counts.items() if count) or "nothing"
+    counts = ", ".join(f"{count} {what}" for what, count in call.counts.items() if count) or "nothing"
     times = f"{format_duration(call.wall_s)}, CPU {format_duration(call.cpu_s)}"
     why = f": {call.message.partition(chr(10))[0]}" if call.exit_code and call.message else ""
-    return f"  {call.begin[:19]} {call.command}: {said}; {times}, exit code {call.exit_code}{why}"
+    return f"  {call.begin[:19]} {call.command}: {counts}; {times}, exit code {call.exit_code}{why}"

@@ -179,8 +179,8 @@ def _verify_map(path: Path) -> Iterator[CheckResult]:
     yield "maps", 1
     place, checksums = Place(path), read_checksums(path)
     yield from _verify_files(place, checksums, f"{path}: copy it again, or add the map again with --force")
-    strange = [entry.name for entry in place.entries() if entry.name not in {*checksums, CHECKSUMS}]
-    yield from (f"{place.where(name)}: is no file of this map" for name in strange if not is_desktop_file(name))
+    foreign = [entry.name for entry in place.entries() if entry.name not in {*checksums, CHECKSUMS}]
+    yield from (f"{place.where(name)}: is no file of this map" for name in foreign if not is_desktop_file(name))
 
 
 def _verify_store(store: Store) -> Iterator[CheckResult]:
@@ -262,18 +262,20 @@ def _verify_rows(place: Place, row: RunFacts, document: str) -> Iterator[CheckRe
 
 
 def _verify_names(place: Place, state: State) -> Iterator[CheckResult]:
-    """Yield payload that no document names, unless a call may still name it, and files that tcpipe did not write."""
-    strange = [name for name in place.list() if name not in (*KINDS, BLOBS, INDEX, REPORT)]
-    strange += find_strange_files(place)
-    strange += [f"{BLOBS}/{name}" for name in place.list(BLOBS) if not BLOB.fullmatch(name)]
-    is_quiet = all(call.state == "killed" for call in list_open_calls(state))
-    left = [str(path) for path in (place.path.glob(f"{TEMPORARY_PREFIX}*") if place.path else ()) if is_abandoned(path)]
+    """Yield unreferenced payload, unless a call is running, and files that tcpipe did not write."""
+    foreign = [name for name in place.list() if name not in (*KINDS, BLOBS, INDEX, REPORT)]
+    foreign += find_strange_files(place)
+    foreign += [f"{BLOBS}/{name}" for name in place.list(BLOBS) if not BLOB.fullmatch(name)]
+    is_no_call_running = all(call.state == "killed" for call in list_open_calls(state))
+    leftovers = [
+        str(path) for path in (place.path.glob(f"{TEMPORARY_PREFIX}*") if place.path else ()) if is_abandoned(path)
+    ]
     for each in find_unnamed(list_payload(place), list_named_files(read_records(place, state)[0])):
         if each.foreign and each.name.endswith(each.foreign):
-            strange.append(each.name)
-        elif is_quiet:
-            left.append(place.where(each.name))
-    yield from (f"{name}: {_KILLED}" for name in sorted(left))
-    for name in strange:
+            foreign.append(each.name)
+        elif is_no_call_running:
+            leftovers.append(place.where(each.name))
+    yield from (f"{name}: {_KILLED}" for name in sorted(leftovers))
+    for name in foreign:
         line = f"{place.where(name)}: is no file of this store"
         yield Repair(line) if is_desktop_file(name) else line

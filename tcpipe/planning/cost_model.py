@@ -108,7 +108,7 @@ Bits = NDArray[np.uint16]
 
 
 def count_reasons(bits: Bits) -> dict[str, int]:
-    """Return how often each reason occurs, without those that do not."""
+    """Return the number of occurrences of each reason that occurs."""
     counts = {flag_name(reason): int(np.count_nonzero(bits & reason)) for reason in Reason}
     return {name: count for name, count in counts.items() if count}
 
@@ -203,12 +203,12 @@ def iterate_predictions(
 
     def judge(patches: Patches, on_map: Mask, first: int) -> SegmentPredictions:
         bits = find_reasons(patches, on_map, model, source)
-        asked = bits & NO_COST == 0
+        is_predicted = bits & NO_COST == 0
         turns = np.full(on_map.size, np.nan) if turn_radpm is None else turn_radpm[first : first + on_map.size]
-        said = predict_patches(model, patches, asked, turns)
-        power_watt, velocity_mps = correction.apply(said.mean[:, 0], said.mean[:, 1], patches.terrain_class)
-        stated = propagate_stated(said.mean, said.covariance)
-        bits[asked & np.isnan(velocity_mps)] |= np.uint16(Reason.NO_MOTION)
+        prediction = predict_patches(model, patches, is_predicted, turns)
+        power_watt, velocity_mps = correction.apply(prediction.mean[:, 0], prediction.mean[:, 1], patches.terrain_class)
+        stated = propagate_stated(prediction.mean, prediction.covariance)
+        bits[is_predicted & np.isnan(velocity_mps)] |= np.uint16(Reason.NO_MOTION)
         known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
         horizontal = np.cos(patches.slope_rad) if model.card.label_velocity == "fused" else 1.0
         middle = patches.pixels["height"][:, px // 2, px // 2] * HEIGHT_STEP_M
@@ -234,7 +234,7 @@ def iterate_predictions(
             first += on_map.size
 
 
-def predict_patches(model: Model, patches: Patches, asked: Mask, turn_radpm: Floats) -> Prediction:
+def predict_patches(model: Model, patches: Patches, is_predicted: Mask, turn_radpm: Floats) -> Prediction:
     """Return power [W] and velocity [m/s] of N patches; NaN if not asked, or if no motion is predicted.
 
     ``asked`` and ``turn_radpm``, the turn of a metre (NaN: as usual), have shape (N,). The commanded speed is the usual
@@ -242,17 +242,20 @@ def predict_patches(model: Model, patches: Patches, asked: Mask, turn_radpm: Flo
     """
     form = model.card.layout
     pixels = {layer: patches.pixels[layer] for layer in form.layers}
-    out, unknown = Prediction.without_covariance(np.full((asked.size, 2), np.nan)), np.full(asked.size, np.nan)
+    out, unknown = (
+        Prediction.without_covariance(np.full((is_predicted.size, 2), np.nan)),
+        np.full(is_predicted.size, np.nan),
+    )
     extra_features = ExtraFeatures(patches.terrain_class.astype(np.int64), patches.slope_rad, turn_radpm, unknown)
-    chosen = np.flatnonzero(asked)
+    chosen = np.flatnonzero(is_predicted)
     for rows in (chosen[first : first + form.batch_rows] for first in range(0, chosen.size, form.batch_rows)):
-        said = model.ask(form.form(pixels, rows), extra_features.take(rows))
-        if said.mean.shape[1] != 2:
+        prediction = model.ask(form.form(pixels, rows), extra_features.take(rows))
+        if prediction.mean.shape[1] != 2:
             raise ModelError(
-                f"{model.name}: gives {said.mean.shape[1]} numbers per patch, expected two: power and velocity; "
+                f"{model.name}: gives {prediction.mean.shape[1]} numbers per patch, expected two: power and velocity; "
                 "train it on both labels"
             )
-        out.mean[rows], out.covariance[rows] = said.mean, said.covariance
+        out.mean[rows], out.covariance[rows] = prediction.mean, prediction.covariance
     needed = out.mean[:, 1:] if model.card.inputs.is_time_alone else out.mean
     out.mean[~(np.isfinite(needed).all(axis=1) & (out.mean[:, 1] > 0.0))] = np.nan
     return out

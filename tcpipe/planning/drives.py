@@ -136,17 +136,17 @@ def predict_run(
     projection = find_map_projection(source, gnss_crs or run.manifest.recipe.read.gnss_crs)
     start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift[:2] for name in ("start", "end"))
     frames = make_patch_frames(start, end, values["chord_m"])
-    said = predict_segments(model, source, frames, turn_radpm=turn_rad / length_m)
-    duration, class_id = values["chord_m"] / said.velocity_mps, said.terrain_class
+    prediction = predict_segments(model, source, frames, turn_radpm=turn_rad / length_m)
+    duration, class_id = values["chord_m"] / prediction.velocity_mps, prediction.terrain_class
     turning = find_added_turning(model)
     turn_joule = 0.0 if turning is None else turning.energy_joule(turn_rad, length_m, class_id, is_driven=True)
     distance_m = np.insert(np.cumsum(np.linalg.norm(np.diff(start, axis=0), axis=1)), 0, 0.0)[: len(start)]
-    energy = said.power_watt * duration + np.nan_to_num(turn_joule)
+    energy = prediction.power_watt * duration + np.nan_to_num(turn_joule)
     both = {
-        "duration": (duration, values["duration_s"], said.duration_std_s),
-        "energy": (energy, measured, said.energy_std_joule),
+        "duration": (duration, values["duration_s"], prediction.duration_std_s),
+        "energy": (energy, measured, prediction.energy_std_joule),
     }
-    rise_m = length_m * np.tan(said.slope_rad)
+    rise_m = length_m * np.tan(prediction.slope_rad)
     is_near = model.find_near(compute_middles([to_floats(segments, name) for name in PLACES]))
     metres = {
         name: Metres(predicted, label, class_id, distance_m, length_m, duration, rise_m, turn_rad, std, is_near)
@@ -156,7 +156,7 @@ def predict_run(
     reasons = [
         [*flag_names(bits, Reason), *[UNCERTAIN] * bool(unsure), *[UNLABELLED] * (not known)]
         for bits, unsure, known in zip(
-            said.reasons, uncertain, np.isfinite(measured + values["duration_s"]), strict=True
+            prediction.reasons, uncertain, np.isfinite(measured + values["duration_s"]), strict=True
         )
     ]
     return MeasuredRun(run.run_id, metres), reasons
@@ -189,7 +189,7 @@ def _list_names(reasons: Reasons) -> list[str]:
 
 
 def find_shifts(source: MapFile, recipe: Recipe, runs: Sequence[StoredRun]) -> tuple[Shifts, list[Finding]]:
-    """Return how far runs are moved on a map, and findings; {} without ``sample.align``."""
+    """Return the shifts of runs on a map, and findings; {} without ``sample.align``."""
     if not recipe.sample.align:
         return {}, []
     registrations, findings = register_runs(runs, source, recipe)

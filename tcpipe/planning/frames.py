@@ -91,7 +91,7 @@ class Frame:
 
 
 def make_frame(source: MapReader, origin_deg: tuple[float, float] | None) -> Frame:
-    """Return the frame of a robot; `UsageError` where its origin is not near the map."""
+    """Return the frame of a robot; `UsageError` if its origin is not near the map."""
     if origin_deg is not None:
         x_m, y_m = find_lonlat_projection(source).forward(np.array([origin_deg]))[0].tolist()
         x_min, y_min, x_max, y_max = source.grid.bounds_m

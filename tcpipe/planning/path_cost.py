@@ -126,7 +126,7 @@ def compute_path_cost(
 def _cut_into_segments(
     source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str, shortest_m: float | None
 ) -> PathSegments:
-    """Return the path segments of a path; `PathError` where it is shorter than one, or than ``shortest_m``."""
+    """Return the path segments of a path; `PathError` if it is shorter than one, or than ``shortest_m``."""
     projection = find_lonlat_projection(source)
     xy_m = projection.forward(lonlat_deg)
     if not np.isfinite(xy_m).all():
@@ -175,11 +175,11 @@ def _sum_costs(  # noqa: PLR0917
         for name, predicted in [(name, found[name]) for name in found if name in errors]:
             std = segments.arc_m * (prediction.duration_std_s if name == "duration" else prediction.energy_std_joule)
             near = model.find_near(compute_middles([located[place] for place in PLACES]))
-            there = Metres(
+            metres = Metres(
                 predicted.value, nothing, class_id, begin_m, segments.arc_m, duration, rise_m, turn_rad, std, near
             )
             found[name] = (
-                predict(errors[name], there) if known is None else adapt(errors[name], known.metres[name], there)
+                predict(errors[name], metres) if known is None else adapt(errors[name], known.metres[name], metres)
             )
     time, joule = found["duration"], found["energy"]
     table = PATH_SEGMENTS.table(

@@ -204,7 +204,7 @@ class PlanResult(PlanTotals):
 
 
 def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
-    """Find the path that is asked for; write it to ``out``, and beside it messages for Nav2."""
+    """Find the requested path; write it to ``out``, with messages for Nav2 in the same folder."""
     out = Path(options.out)
     _check_output(out)
     start, goal = (np.array(end, float) for end in (options.start, options.goal))

@@ -60,7 +60,7 @@ class PlanTotals(PathTotals):
     """The quantity that is minimised."""
     allow_extrapolation: bool
     finalists: int
-    """Paths that were judged; this one is the best of them."""
+    """Number of compared paths; this one is the best."""
     predicted_cells: int
     """Cells that the model predicted."""
     negative_steps: int
@@ -125,7 +125,7 @@ def plan_path(
     search = _Search(survey, projection.forward(ends_deg), ends_deg, allow_extrapolation)
     search.check_ends()
     search.predict_ground()
-    lines, negative = search.find_finalists(objective, None if risk is None else errors)
+    lines, negative = search.find_candidate_paths(objective, None if risk is None else errors)
     lonlats = [projection.inverse(xy_m) for xy_m in lines]
     costs = [compute_path_cost(survey.model, survey.source, lonlat, where="the planned path") for lonlat in lonlats]
     judged = [_judge(cost, objective, risk) for cost in costs]
@@ -180,12 +180,12 @@ class _Search:
         labels = [
             f"--{name} {lon:.6f},{lat:.6f}" for name, (lon, lat) in zip(("from", "to"), self.ends_deg, strict=True)
         ]
-        on = np.isfinite(self.ends_xy_m).all(axis=1) & source.grid.contains(
+        is_on_map = np.isfinite(self.ends_xy_m).all(axis=1) & source.grid.contains(
             np.nan_to_num(self.ends_xy_m, posinf=np.inf)
         )
         problems += [
             describe_off_map(source, label, end[None])
-            for label, end, inside in zip(labels, self.ends_deg, on, strict=True)
+            for label, end, inside in zip(labels, self.ends_deg, is_on_map, strict=True)
             if not inside
         ]
         if problems:
@@ -223,7 +223,7 @@ class _Search:
                 )
                 survey.predict(ellipse)
             self._check_open()
-            paths = self._find("distance")[1]
+            paths = self._search("distance")[1]
             if paths and (paths[0].cost * DETOUR <= bound_m * _GRID or ellipse.all()):
                 return
             if ellipse.all():
@@ -259,14 +259,14 @@ class _Search:
     def _metres(self) -> Floats:
         return self.survey.frames.metres(self._cells)
 
-    def _find(
+    def _search(
         self,
         objective: Objective,
         class_id: Classes | None = None,
         errors: QuantityErrors | None = None,
         caution: float = 0.0,
     ) -> tuple[GridSteps, tuple[LeastCostPath, ...]]:
-        """Return steps over predicted cells and the best paths; with the cells' classes, one with turns is first."""
+        """Return steps over predicted cells, and the best paths; with classes, the first one includes costs of turns."""
         costs, (start, goal) = self.survey.costs, self._cells.tolist()
         open_ = costs.open_courses(allow_extrapolation=self.allow_extrapolation) & self.survey.predicted
         per_metre = costs.per_metre(objective)
@@ -281,22 +281,22 @@ class _Search:
         turning = find_turning(self.survey.model.card.physics, self.survey.model.card.class_table)
         return steps, find_least_cost_paths(steps, find_best_potential(steps), start, goal, turning, class_id)
 
-    def find_finalists(
+    def find_candidate_paths(
         self, objective: Objective, errors: Mapping[str, QuantityErrors] | None
     ) -> tuple[list[Floats], int]:
         """Return lines of candidate paths, (P, 2) each, and the number of free steps of the objective's search.
 
-        They are the best of each objective, and with ``errors`` those of little risk.
+        Candidates are the best paths of each objective, and, with ``errors``, paths that avoid uncertain cells.
         """
         class_id, lines, negative = self.survey.class_id(), list[Floats](), 0
         for name in OBJECTIVES:
-            steps, paths = self._find(name, class_id)
+            steps, paths = self._search(name, class_id)
             negative = paths[0].negative_steps if name == objective else negative
             lines += self._draw_lines(steps, paths)
         if errors is not None and objective != "distance":
             of_cell = errors["energy" if objective == "energy" else "duration"]
             for caution in _CAUTIONS:
-                lines += self._draw_lines(*self._find(objective, class_id, of_cell, caution))
+                lines += self._draw_lines(*self._search(objective, class_id, of_cell, caution))
         return list({np.round(line, 3).tobytes(): line for line in lines}.values()), negative
 
     def _draw_lines(self, steps: GridSteps, paths: tuple[LeastCostPath, ...]) -> Iterator[Floats]:
@@ -313,6 +313,6 @@ class _Search:
         text = f"no path from start to goal on map {self.survey.source.name}"
         if not self.allow_extrapolation:
             other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_extrapolation=True)
-            if other._find("distance")[1]:
+            if other._search("distance")[1]:
                 return f"{text} within the training range of the model; --allow-extrapolation crosses other ground"
         return f"{text}: the ground between them is not traversable or has no data"

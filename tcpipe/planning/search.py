@@ -183,10 +183,10 @@ def _fill_costs(steps: GridSteps, k: float, goal: int, out: Floats) -> int:
                 continue
             step = compute_step(steps, k, course, row1, col1)
             negative += step < 0.0
-            there = cost + max(step, _LEAST)
-            if there < out[row1 * cols + col1]:
-                out[row1 * cols + col1] = there
-                heappush(heap, (there, row1 * cols + col1))
+            new_cost = cost + max(step, _LEAST)
+            if new_cost < out[row1 * cols + col1]:
+                out[row1 * cols + col1] = new_cost
+                heappush(heap, (new_cost, row1 * cols + col1))
     return negative
 
 
@@ -271,10 +271,10 @@ def _find_turning(  # noqa: PLR0917
             else:
                 step = per_rad * (turns_rad[course] if way == _LEFT else turns_rad[course - 1])
                 into, other = cell, cell * courses + (course + (1 if way == _LEFT else -1)) % courses
-            there = cost + max(step, _LEAST)
-            if arrived[other] == 0 or there < labels[other]:
-                labels[other], arrived[other] = there, way
-                heappush(heap, (there + to_goal[into], other))
+            new_cost = cost + max(step, _LEAST)
+            if arrived[other] == 0 or new_cost < labels[other]:
+                labels[other], arrived[other] = new_cost, way
+                heappush(heap, (new_cost + to_goal[into], other))
     return -1
 
 

@@ -32,9 +32,9 @@ _SHORTEST_HALT_NS = 1_000_000_000
 
 def measure_rest_currents(rail: Rail, still_ns: Ints) -> Floats:
     """Return a rail's mean current in each stop of 1 s or more [A]; ``still_ns``: begin and end [ns], shape (S, 2)."""
-    settled = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
-    settled = settled[settled[:, 1] - settled[:, 0] >= _SHORTEST_HALT_NS]
-    first, last = (np.searchsorted(rail.current.stamp_ns, at_ns) for at_ns in settled.T)
+    inner_ns = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
+    inner_ns = inner_ns[inner_ns[:, 1] - inner_ns[:, 0] >= _SHORTEST_HALT_NS]
+    first, last = (np.searchsorted(rail.current.stamp_ns, at_ns) for at_ns in inner_ns.T)
     sums = np.concatenate(([0.0], np.cumsum(rail.current.value)))
     used = last > first
     return np.asarray((sums[last] - sums[first])[used] / (last - first)[used])
@@ -127,9 +127,9 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     def judge(first: int) -> tuple[float, float]:
         """Return how much better a step fits than a constant, and than a gradual change [variances]."""
         # The level of the current steps, too, when its gain does, which disturbs the blocks beside it.
-        apart = np.abs(place - first + 0.5) > 1.0
-        by, at = np.sqrt(weight[apart]), place[apart]
-        target = resistance[apart] * by
+        is_apart = np.abs(place - first + 0.5) > 1.0
+        by, at = np.sqrt(weight[is_apart]), place[is_apart]
+        target = resistance[is_apart] * by
 
         def unexplained(*columns: Floats | NDArray[np.bool_ | np.int64]) -> float:
             design = np.column_stack(columns) * by[:, None]

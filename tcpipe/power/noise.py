@@ -84,7 +84,7 @@ def compute_median_period_s(signal: SampledSignal) -> float:
 
 
 def estimate_resolution(signal: SampledSignal) -> float:
-    """Return the quantisation step of a record, in its own unit; 0 where none shows (most values differ)."""
+    """Return the quantisation step of a record, in its own unit; 0 if none shows (most values differ)."""
     levels = np.unique(signal.value)
     return float(np.median(np.diff(levels))) if 1 < len(levels) < 0.5 * len(signal.value) else 0.0
 
@@ -195,21 +195,21 @@ def fit_signal_model(signal: SampledSignal, steady: Mask, still: Mask, *, averag
     signal is the mean since the one before it.
     """
     period_s, size = compute_median_period_s(signal), np.zeros(len(_PROCESSES))
-    spacing, seen, weight = _compute_second_differences(signal, steady, period_s)
+    spacing, observed, weight = _compute_second_differences(signal, steady, period_s)
     if not len(spacing):
-        spacing, seen, weight = _compute_second_differences(signal, np.ones_like(steady), period_s)
+        spacing, observed, weight = _compute_second_differences(signal, np.ones_like(steady), period_s)
     if not len(spacing):
         return SignalModel(0.0, np.zeros(len(_TAU)), period_s * _TAU, 0.0, 0.0)
-    shown = _PROCESSES @ _predict_second_differences(spacing, averaged=averaged)
+    predicted = _PROCESSES @ _predict_second_differences(spacing, averaged=averaged)
     error = _estimate_error_variance(signal, still, period_s, averaged=averaged)
     if error is None:
-        columns = np.vstack((np.ones(len(spacing)), shown[2:]))  # faster processes look like independent errors
-        error, *size[2:] = nnls((columns * weight).T, seen * weight)[0].tolist()
+        columns = np.vstack((np.ones(len(spacing)), predicted[2:]))  # faster processes look like independent errors
+        error, *size[2:] = nnls((columns * weight).T, observed * weight)[0].tolist()
     else:
-        error = min(error, float(seen.min()))
-        size = nnls((shown * weight).T, (seen - error) * weight)[0]
+        error = min(error, float(observed.min()))
+        size = nnls((predicted * weight).T, (observed - error) * weight)[0]
     slope_variance = float(size @ _SLOPES) / period_s**2
-    return SignalModel(error, size @ _PROCESSES, period_s * _TAU, float(size @ shown[:, 0]), slope_variance)
+    return SignalModel(error, size @ _PROCESSES, period_s * _TAU, float(size @ predicted[:, 0]), slope_variance)
 
 
 def estimate_local_scale(
@@ -225,8 +225,8 @@ def estimate_local_scale(
     sums, counts = (np.append(0.0, np.cumsum(each)) for each in (compute_curvature(signal) * used, used))
     first, last = np.searchsorted(near, start_ns - _LOCAL_NS), np.searchsorted(near, end_ns + _LOCAL_NS, side="right")
     expected = model.curvature_variance + model.error_variance
-    here = (sums[last] - sums[first] + _PRIOR_SAMPLES * expected) / (counts[last] - counts[first] + _PRIOR_SAMPLES)
-    return np.asarray(np.maximum((here - model.error_variance) / model.curvature_variance, _MIN_SCALE))
+    local = (sums[last] - sums[first] + _PRIOR_SAMPLES * expected) / (counts[last] - counts[first] + _PRIOR_SAMPLES)
+    return np.asarray(np.maximum((local - model.error_variance) / model.curvature_variance, _MIN_SCALE))
 
 
 def compute_curvature(signal: SampledSignal) -> Floats:

@@ -25,8 +25,8 @@ def find_missing_rows(voltage_volt: Floats, current_amp: Floats) -> Mask:
     """
     has_voltage, has_current = np.isfinite(voltage_volt), np.isfinite(current_amp)
     live = voltage_volt[has_voltage & (voltage_volt > 0.0)]
-    usual = np.median(live) if live.size else np.nan
-    low, high = (read_threshold(EXCLUDED, name) * usual for name in ("min_of_median", "max_of_median"))
+    median_volt = np.median(live) if live.size else np.nan
+    low, high = (read_threshold(EXCLUDED, name) * median_volt for name in ("min_of_median", "max_of_median"))
     missing: Mask = has_voltage & ~((voltage_volt >= low) & (voltage_volt <= high))
     both, lone = np.count_nonzero(has_voltage & has_current), current_amp[has_current & ~has_voltage]
     is_paired = 2 * both > np.count_nonzero(has_voltage | has_current) or (both and 0 < np.unique(lone).size <= _MARKS)
@@ -56,14 +56,14 @@ def find_isolated(values: Floats, time_s: Floats) -> tuple[Mask, bool]:
     limit, low_limit, times = (
         read_threshold(EXCLUDED, f"max_{name}") for name in ("of_top", "of_top_clear", "scatters")
     )
-    scatter, far = max(np.quantile(deviation, 0.9), np.median(steps)), relative > limit
-    isolated[rest] = far | ((relative > low_limit) & (deviation > times * scatter))
+    scatter, is_far = max(np.quantile(deviation, 0.9), np.median(steps)), relative > limit
+    isolated[rest] = is_far | ((relative > low_limit) & (deviation > times * scatter))
     found[rows] = isolated[np.cumsum(new) - 1]
     _, (by_wide_median,) = _compare_with_median(value[rest], 11, (0.99,))
     block = np.flatnonzero(by_wide_median > limit)
     runs = np.split(rest[block], np.flatnonzero(np.diff(block) > 1) + 1)
     is_block = any(run.size > 2 and at_s[run[-1]] - at_s[run[0]] < _SHORTEST_DRIVE_S for run in runs)
-    share = max(far.mean(), np.mean(by_most > limit))
+    share = max(is_far.mean(), np.mean(by_most > limit))
     return found, bool(is_block or share > read_threshold(REJECTED, "max_isolated_fraction"))
 
 
@@ -99,7 +99,7 @@ def undo_overflow(current_amp: Floats) -> tuple[Floats, float, bool]:
         return current_amp, 0.0, False
     whole = current_amp.copy()
     whole[rows[1:]] -= span * np.cumsum(np.where(jumps, np.sign(step), 0.0))
-    usual = _compute_usual(step[~jumps])
-    if np.quantile(np.abs(np.diff(whole[rows]))[jumps], 0.9) > max(usual, 3.0 * quantum):
+    usual_step = _compute_usual(step[~jumps])
+    if np.quantile(np.abs(np.diff(whole[rows]))[jumps], 0.9) > max(usual_step, 3.0 * quantum):
         return current_amp, 0.0, False
-    return whole, span, usual < span / 4.0
+    return whole, span, usual_step < span / 4.0

@@ -187,8 +187,8 @@ def count_samples_inside(rails: list[Rail], start_ns: Ints, end_ns: Ints) -> tup
     mean = np.full(len(start_ns), np.nan if not rails else 0.0)
     for i, each in enumerate(rails):
         before, until = (np.searchsorted(each.current.stamp_ns, at, side="right") for at in (start_ns, end_ns))
-        mine = (until - before).astype(np.int64)
-        count = mine if i == 0 else np.minimum(count, mine)
+        samples = (until - before).astype(np.int64)
+        count = samples if i == 0 else np.minimum(count, samples)
         sums = np.concatenate(([0.0], np.cumsum(each.voltage_volt * each.current_amp)))
         first, last = (np.searchsorted(each.stamp_ns, at, side="right") for at in (start_ns, end_ns))
         part = np.full(len(start_ns), np.nan)
@@ -239,8 +239,8 @@ def estimate_idle_power(power_watt: Floats, halt: Ints, *, window_rows: int, ste
     known = np.isfinite(power_watt)
     if np.count_nonzero(known) < FEWEST_ROWS:
         return IdlePower(np.nan, np.nan)
-    settled = known & (halt >= 0)
-    used = settled if settled.any() else known
+    is_inner = known & (halt >= 0)
+    used = is_inner if is_inner.any() else known
     halts = [power_watt[used & (halt == number)] for number in np.unique(halt[used]).tolist()]
     seconds = _split_halts(halts, window_rows)
     means = np.array([each.mean() for each in seconds])

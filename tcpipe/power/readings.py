@@ -251,9 +251,9 @@ def _find_sides(topics: Topics, sources: Sequence[PowerSource], rails: Rails, si
         of_sign = -1 if sources[0].sign == "drawn_negative" else 1
         first, second = (of_sign * sign * field.sign * read_values(columns, field) for field in fields_added)
         return Sides(np.asarray(columns[_LOG_TIME], float), first, second)
-    every = _list_rails(rails)
-    left, right = ([entry for entry in every if side in entry[1].name.lower()] for side in ("left", "right"))
-    if len(every) != 2 or len(left) != 1 or len(right) != 1:
+    entries = _list_rails(rails)
+    left, right = ([entry for entry in entries if side in entry[1].name.lower()] for side in ("left", "right"))
+    if len(entries) != 2 or len(left) != 1 or len(right) != 1:
         return None
     left_ns, right_ns = (np.asarray(topics[topic][1][_LOG_TIME], float) for topic, _ in (*left, *right))
     left_amp, right_amp = (rail.current_amp for _, rail in (*left, *right))
@@ -321,8 +321,8 @@ def _read_first_valid(
 def _find_gain_std(source: PowerSource, joints: JointPower | None) -> float:
     """Return the σ of a rail's gain; an error of torques changes their loss twice as much."""
     loss = joints.loss_fraction if joints else 0.0
-    usual = TORQUE_GAIN_STD_FRACTION if joints else GAIN_STD_FRACTION
-    stated = usual if source.gain_std_fraction is None else source.gain_std_fraction
+    default_std = TORQUE_GAIN_STD_FRACTION if joints else GAIN_STD_FRACTION
+    stated = default_std if source.gain_std_fraction is None else source.gain_std_fraction
     nominal = 0.0 if source.nominal_voltage_volt is None else source.nominal_voltage_std_fraction
     return math.hypot(stated * (1.0 + loss), LOSS_STD_FRACTION * loss, nominal)
 
@@ -482,7 +482,7 @@ def _undo_overflows(
 
 
 def _correlate_voltage(rails: Rails, log_times: Mapping[str, Floats]) -> float:
-    """Return the correlation of voltage and whole current within seconds, of either sign; 0 where it is unknown."""
+    """Return the correlation of voltage and whole current within seconds, of either sign; 0 if it is unknown."""
     time_s, amp = _sum_currents(rails, log_times)
     volts = ((log_times[topic], rail.voltage_volt) for topic, rail in _list_rails(rails))
     at_ns, volt = next(each for each in volts if np.isfinite(each[1]).any())
@@ -529,7 +529,7 @@ def _find_sign(code: str, names: Mapping[str, str], net: float, *signs: str) -> 
 
 
 def _weight_s(time_s: Floats) -> Floats:
-    """Return the time of each row [s]; beside a gap no more than usual, or one row would outweigh a run."""
+    """Return the time of each row [s]; next to a gap at most the usual period, so that no row dominates a run."""
     if time_s.size < 2:
         return np.ones_like(time_s)
     between = np.gradient(time_s)

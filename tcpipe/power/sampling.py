@@ -56,7 +56,7 @@ def _has_jumps(values: Floats) -> bool:
 
 
 def _find_reading_period(interval: Floats) -> float | None:
-    """Return how many messages a reading lasts, by intervals between changes; None if they are not regular."""
+    """Return the period of readings in messages, from intervals between changes; None if they are irregular."""
     period = float(interval[interval <= 1.5 * np.quantile(interval, 0.2)].mean())
     for _ in range(3):
         count = np.maximum(np.rint(interval / period), 1.0)
@@ -82,8 +82,8 @@ def _find_arrivals(at_ns: Floats, changed: Ints, *, period_ns: float, message_ns
     resumed = np.flatnonzero(np.diff(at_ns) > period_ns) + 1
     found = [changed[:0]]
     for rows in np.split(np.arange(at_ns.size), resumed):
-        mine = changed[(changed > rows[0]) & (changed <= rows[-1])]
-        anchor = at_ns[mine] if mine.size else at_ns[rows[:1]]
+        changed_rows = changed[(changed > rows[0]) & (changed <= rows[-1])]
+        anchor = at_ns[changed_rows] if changed_rows.size else at_ns[rows[:1]]
         begin = anchor[0] - np.floor((anchor[0] - at_ns[rows[0]]) / period_ns) * period_ns
         end = anchor[-1] + np.floor((at_ns[rows[-1]] - anchor[-1]) / period_ns) * period_ns
         anchor = np.concatenate(([begin], anchor, [end]))
@@ -91,8 +91,8 @@ def _find_arrivals(at_ns: Floats, changed: Ints, *, period_ns: float, message_ns
         count = np.maximum(np.rint(between / period_ns), 1.0).astype(np.int64)
         step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         expected = np.repeat(anchor[:-1], count) + step * np.repeat(between / count, count)
-        equal = np.setdiff1d(np.append(expected, end), at_ns[mine])
-        found += [mine, np.maximum(np.searchsorted(at_ns, equal - 0.5 * message_ns), rows[0])]
+        equal = np.setdiff1d(np.append(expected, end), at_ns[changed_rows])
+        found += [changed_rows, np.maximum(np.searchsorted(at_ns, equal - 0.5 * message_ns), rows[0])]
     return np.unique(np.concatenate(found))
 
 
@@ -123,9 +123,9 @@ def is_stated_averaged(
     fit = make_power_fit(power, motion_ns, motion, averaged=False, margin_s=2.0 * period_s)
     if fit is None:
         return None
-    left = np.array([fit.fit_means(late * period_s, period_s).sum() for late in _DELAYS])
-    best = _DELAYS[int(np.argmin(left))]
-    sampled, averaged = (float(np.interp(late, _DELAYS, left)) for late in (0.0, 0.5))
+    squares = np.array([fit.fit_means(late * period_s, period_s).sum() for late in _DELAYS])
+    best = _DELAYS[int(np.argmin(squares))]
+    sampled, averaged = (float(np.interp(late, _DELAYS, squares)) for late in (0.0, 0.5))
     if min(abs(best), abs(best - 0.5)) > _NEAR or min(sampled, averaged) > _MAX_RESIDUAL_RATIO * max(sampled, averaged):
         return None
     return averaged < sampled
@@ -203,7 +203,7 @@ def make_power_fit(
 
 
 def find_delay(fit: PowerFit) -> tuple[float, float] | None:
-    """Return the delay of power behind motion [s] and its standard deviation; None where motion does not determine it.
+    """Return the delay of power behind motion [s] and its standard deviation; None if motion does not determine it.
 
     The standard deviation is that of the delete-a-group jackknife over parts of the run.
     """
@@ -230,7 +230,7 @@ def _find_minimum(squares: Floats) -> float:
 
 
 def find_smoothing(fit: PowerFit, *, corrected_s: float = 0.0) -> Smoothing | None:
-    """Return over how long power [W] is smoothed, by the motion that it follows; None where that is not sure.
+    """Return over how long power [W] is smoothed, by the motion that it follows; None if that is not sure.
 
     A mean must explain more than a delay alone, and clearly more than means about the stamp, which fit better if the
     motion is noisy. ``corrected_s`` is the recipe's correction of the stamps [s]: a mean ends at the uncorrected stamp.

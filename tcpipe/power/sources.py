@@ -78,11 +78,11 @@ def compute_joint_power(motion: JointMotion, source: PowerSource, *, sign: int) 
     """Return the power of joints, with torques times ``sign``; NaN in rows that lack one."""
     loss = source.loss_watt_per_nm2 * motion.torque_nm**2
     joint = sign * motion.torque_nm * motion.speed_radps + loss
-    drawn = joint if source.recovered else np.where(joint < 0.0, 0.0, joint)
-    watt = drawn.sum(axis=1)
+    drawn_watt = joint if source.recovered else np.where(joint < 0.0, 0.0, joint)
+    watt = drawn_watt.sum(axis=1)
     known = np.isfinite(watt)
     total = float(watt[known].sum())
-    lost, returned = float(loss[known].sum()), float((drawn - joint)[known].sum())
+    lost, returned = float(loss[known].sum()), float((drawn_watt - joint)[known].sum())
     return JointPower(motion.names, watt, *((lost / total, returned / total) if total > 0.0 else (0.0, 0.0)))
 
 
@@ -150,10 +150,10 @@ def find_sources(
 
 def list_power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[str]:
     """Return the columns inside lists of messages that a type's tables name (drivers[].current), and joint names."""
-    mine = [source for source in known if source.type == type_name]
-    texts = [text for source in mine for text in (source.voltage, source.current, source.power, source.energy)]
+    of_type = [source for source in known if source.type == type_name]
+    texts = [text for source in of_type for text in (source.voltage, source.current, source.power, source.energy)]
     numbers = {field.column for text in texts for field in parse_fields(text) if "[]." in field.column}
-    return frozenset(numbers | ({NAMES} if any(source.joints for source in mine) else set()))
+    return frozenset(numbers | ({NAMES} if any(source.joints for source in of_type) else set()))
 
 
 def _select_most_specific(fitting: Sequence[PowerSource]) -> list[PowerSource]:
@@ -240,8 +240,8 @@ def _read_joints(columns: Columns, source: PowerSource, topic: str) -> RailReadi
     """Return the power of a source's joints, or why it is unknown; torques against the motion have the wrong sign."""
     motion = select_joints(columns, source)
     if not motion.names:
-        there = ", ".join(np.unique(columns[NAMES]).tolist())
-        return reject_power(topic, "no-joint", names={"wanted": source.joints, "joints": there})
+        known_joints = ", ".join(np.unique(columns[NAMES]).tolist())
+        return reject_power(topic, "no-joint", names={"wanted": source.joints, "joints": known_joints})
     for reason, values in (("no-effort", motion.torque_nm), ("no-velocity", motion.speed_radps)):
         if lacking := [name for name, column in zip(motion.names, values.T, strict=True) if np.isnan(column).all()]:
             return reject_power(topic, reason, names={"joints": ", ".join(lacking)})
@@ -272,8 +272,12 @@ def _find_misfit(columns: Columns, source: PowerSource, topic: str, known: Seque
         needed = field.index + 1 if field.index is not None else int(field.every)
         listed = source.currents_listed if field in currents else None
         if (needed and (width or 0) < needed) or listed not in (None, width):
-            fitting = [by for by in known if width and by.type == source.type and by.currents_listed == width]
-            if platforms := sorted({by.platform for by in fitting if by.platform}):
+            fitting = [
+                candidate
+                for candidate in known
+                if width and candidate.type == source.type and candidate.currents_listed == width
+            ]
+            if platforms := sorted({candidate.platform for candidate in fitting if candidate.platform}):
                 names["platforms"] = ", ".join(platforms)
             counts = {"values_count": width or 0, "expected_count": listed or needed}
             return reject_power(topic, "values-count-differs", names=names, **counts)
@@ -377,7 +381,7 @@ def find_wrap(current_amp: Floats) -> float | None:
 
 
 def unwrap_currents(current_amp: Floats, wraps_amp: float) -> Floats:
-    """Return currents [A], shape (N,), with those negative again that were read as unsigned."""
+    """Return currents [A], shape (N,), with the sign restored of values that were read as unsigned."""
     return np.where(current_amp > wraps_amp / 2, current_amp - wraps_amp, current_amp)
 
 
@@ -413,7 +417,7 @@ def read_values(columns: Columns, field: FieldPath) -> Floats:
 
 
 def find_rejection(rail: RailReadings, topic: str, columns: Columns) -> Finding | None:
-    """Return why a rail's numbers cannot be power, with the evidence, or None where they can.
+    """Return why a rail's numbers cannot be power, with the evidence, or None if they can.
 
     Each rule needs every row to agree, or the median; a single deviating row is no evidence.
     """

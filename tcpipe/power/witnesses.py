@@ -137,14 +137,14 @@ def compare_charge(time_s: Floats, current_amp: Floats, charge_ah: Floats) -> fl
     ``time_s`` [s], ``current_amp`` [A] (positive when drawn), ``charge_ah`` [Ah]: shape (N,); NaN is not measured.
     """
     known = np.isfinite(charge_ah) & (charge_ah > 0.0)
-    drawn = np.isfinite(current_amp)
-    if known.sum() < 2 or drawn.sum() < 2:
+    is_known = np.isfinite(current_amp)
+    if known.sum() < 2 or is_known.sum() < 2:
         return None
     first, last = np.flatnonzero(known)[[0, -1]]
     fall_ah = float(charge_ah[first] - charge_ah[last])
     if fall_ah < _MIN_CHARGE_FALL * charge_ah[first]:
         return None
-    inside = drawn & (time_s >= time_s[first]) & (time_s <= time_s[last])
+    inside = is_known & (time_s >= time_s[first]) & (time_s <= time_s[last])
     return float(np.trapezoid(current_amp[inside], time_s[inside])) / 3600.0 / fall_ah if inside.sum() > 1 else None
 
 

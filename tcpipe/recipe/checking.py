@@ -37,7 +37,7 @@ _TYPES = {
 def validate_fields(made: Any, section: str) -> None:
     """Check every field of a frozen dataclass and keep it as a plain value; `RecipeError` lists every wrong field.
 
-    ``section`` is the name of its keys before the dot, "" where they have none.
+    ``section`` is the name of its keys before the dot, "" if they have none.
     """
     problems: list[str] = []
     cls: type = type(made)
@@ -84,7 +84,7 @@ def describe(*kinds: Any, file: str = "") -> tuple[list[dict[str, Any]], dict[st
 
 
 def format_values(kind: Any) -> str:
-    """Return the choices or the bounds of an annotation, "" where it has none."""
+    """Return the choices or the bounds of an annotation, "" if it has none."""
     ((schema,), _) = describe(kind)
     schema = schema.get("anyOf", [schema])[0]
     return _format_schema(schema) if "enum" in schema else _format_range(schema)
@@ -114,7 +114,7 @@ def _read_key_docstrings(cls: type) -> Mapping[str, str]:
 
 
 def _format_range(schema: Mapping[str, Any]) -> str:
-    """Return the bounds of a number by its JSON Schema, "" where it has none."""
+    """Return the bounds of a number by its JSON Schema, "" if it has none."""
     words = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to", "exclusiveMaximum": "to below"}
     bounds = ((word, schema[key]) for key, word in words.items() if key in schema)
     return " ".join(f"{word} {bound if isinstance(bound, int) else f'{bound:.12g}'}" for word, bound in bounds)

@@ -62,7 +62,7 @@ def format_first(values: Iterable[float]) -> str:
 
 
 def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Remedy, ...]:
-    """Return a remedy that changes keys of the recipe; none where the recipe would reject them.
+    """Return a remedy that changes keys of the recipe; none if the recipe would reject them.
 
     ``name``: key in ``remedies`` of the finding's code in the catalogue; ``tables``: as in `RecipeFragment`.
     """

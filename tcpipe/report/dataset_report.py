@@ -296,7 +296,7 @@ def _find_indices(table: pa.Table, column: str, names: Sequence[str]) -> NDArray
 
 
 def find_first_starts_ns(card: DatasetCard, table: pa.Table) -> list[int]:
-    """Return when each run's first sample begins [ns]; 0 where it has none."""
+    """Return when each run's first sample begins [ns]; 0 if it has none."""
     first = table.select(["run_id", "start_ns"]).group_by("run_id").aggregate([("start_ns", "min")])
     starts_ns = dict(zip(*(first.column(name).to_pylist() for name in ("run_id", "start_ns_min")), strict=True))
     return [starts_ns.get(run.run_id, 0) for run in card.runs]

@@ -91,7 +91,7 @@ _BUDGET_ROWS = {
 
 
 def make_budget_sections(budget: EnergyBudget | None) -> list[PageSection]:
-    """Return the section on the noise floor of E; none where no segment has an energy."""
+    """Return the section on the noise floor of E; none if no segment has an energy."""
     if budget is None:
         return []
     shares = {text: getattr(budget, name) for name, text in _BUDGET_ROWS.items()}

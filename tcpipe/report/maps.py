@@ -33,10 +33,8 @@ from tcpipe.terrain.layers import TerrainClass
 Pictures = Mapping[str, str]
 """Pictures of a map by name, as data URIs; the first is visible."""
 
-_MOST_POINTS = 2_000
-"""Points of a track on the map of a store."""
-_LEAST_SHARE = 0.5
-"""Smallest share of the track on a map that becomes its background."""
+_MOST_POINTS = 2_000  # points of a track on the map of a store
+_LEAST_SHARE = 0.5  # smallest share of the track on a map that becomes its background
 
 
 def draw_dataset_map(directory: Path, card: DatasetCard, xy_m: Floats) -> tuple[list[Plot], list[str]]:
@@ -102,9 +100,9 @@ def draw_dataset_map(directory: Path, card: DatasetCard, xy_m: Floats) -> tuple[
         nonselection_fill_alpha=0.08,
         source=points.data_source,
     )
-    here = {name: list[float]() for name in ("x", "y", "across", "up")}
+    columns = {name: list[float]() for name in ("x", "y", "across", "up")}
     ring = {"size": 16, "fill_alpha": 0.0, "line_color": CURSOR, "line_width": 3}
-    marks = figure.scatter("x", "y", source=here, name="here", **ring)
+    marks = figure.scatter("x", "y", source=columns, name="here", **ring)
     brush.figure.scatter("across", "up", source=marks.data_source, **ring)
     return [plot, brush, _draw_histogram()], lost
 

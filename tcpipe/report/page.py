@@ -127,24 +127,24 @@ def show_verdict(
     by_code: dict[tuple[Severity, str], list[Finding]] = {}
     for finding in sort_findings(findings):
         by_code.setdefault((finding.severity, finding.code), []).append(finding)
-    shown = []
+    entries = []
     for (severity, code), of_code in by_code.items():
         observed = [(describe_finding(finding), finding.span_s) for finding in of_code]
-        shown.append(ShownFinding(severity, code, find_entry(code).title, observed, list_remedies(of_code)))
+        entries.append(ShownFinding(severity, code, find_entry(code).title, observed, list_remedies(of_code)))
     for group, total, noun in groups:
         title, text = find_entry(group.code).title, describe_group(group, total, noun)
-        shown.append(ShownFinding(group.severity, group.code, title, [(text, None)], list_remedies(group.findings)))
-    problems = [line for severity in ("error", "warning") for line in shown if line.severity == severity]
+        entries.append(ShownFinding(group.severity, group.code, title, [(text, None)], list_remedies(group.findings)))
+    problems = [line for severity in ("error", "warning") for line in entries if line.severity == severity]
     return VerdictBox(
         grades=tuple((name, getattr(verdict, name), _describe_witnesses(verdict, name)) for name in labels),
         shown=tuple(problems[:MOST_LINES]),
         more=tuple(problems[MOST_LINES:]),
-        notes=tuple(line for line in shown if line.severity == "note" and line.code != WITNESSES_OF_LABEL),
+        notes=tuple(line for line in entries if line.severity == "note" and line.code != WITNESSES_OF_LABEL),
     )
 
 
 def _describe_witnesses(verdict: Verdict, label: Affected) -> str:
-    """Return size and witnesses of a label; "" where it has none."""
+    """Return size and witnesses of a label; "" if it has none."""
     finding = verdict.find_label(label)
     return "" if finding is None else " · ".join(describe_label(label, finding)).removeprefix(label).strip()
 
@@ -199,8 +199,8 @@ def render_page(
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters["cell"] = _format_cell
-    drawn = [plot for section in sections for part in (section, *section.parts) for plot in part.plots]
-    figures, ids = plots.render_plots(drawn)
+    all_plots = [plot for section in sections for part in (section, *section.parts) for plot in part.plots]
+    figures, ids = plots.render_plots(all_plots)
     page = environment.from_string(_read_file("page.html.j2")).render(
         title=title,
         lead=lead,
@@ -210,7 +210,7 @@ def render_page(
         links=links,
         made_from=_MADE_FROM.format(made_from) if made_from else "",
         sections=sections,
-        ids={plot.figure.name: id_ for plot, id_ in zip(drawn, ids, strict=True)},
+        ids={plot.figure.name: id_ for plot, id_ in zip(all_plots, ids, strict=True)},
         read_file=_read_file,
         version=__version__,
         style=_read_file("page.css"),

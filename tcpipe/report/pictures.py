@@ -174,8 +174,7 @@ def write_overview(path: Path, picture: Bytes) -> None:
 
 
 MOST_PATCHES = 500
-_PX = 48
-"""Side of a patch in the page; larger ones are thinned."""
+_PX = 48  # side of a patch in the page; larger ones are thinned
 
 _MOST_PIECES = 24
 """Pieces of the files that are read: the order of patches is random, so a few pieces contain all kinds."""

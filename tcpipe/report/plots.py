@@ -31,8 +31,7 @@ from tcpipe.report.colours import CURSOR, DROPPED, KEPT, SPLIT_COLOURS
 BOKEH_SCRIPT = Path(bokeh.__file__).parent / "server/static/js/bokeh.min.js"
 """The part of BokehJS that a page needs."""
 _TEX = re.compile(r"\$\$|\\\(|\\\[")
-_UNREAD = "\u2060"
-"""Between the signs of a formula it keeps a name from being read as one; it takes no room."""
+_UNREAD = "\u2060"  # between the signs of a formula it keeps a name from being read as one; it takes no room
 
 
 @dataclass(frozen=True, slots=True)

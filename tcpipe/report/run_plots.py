@@ -21,8 +21,7 @@ from tcpipe.tables.findings import Finding
 MOST_VALUES = 80_000
 """Most values of a series on the page; longer series are thinned."""
 
-_GAP_PERIODS = 10
-"""Periods without a value that interrupt a line."""
+_GAP_PERIODS = 10  # periods without a value that interrupt a line
 
 _BETWEEN_EPOCHS_S = 1.0
 
@@ -35,8 +34,7 @@ _TRACK_COLUMNS = {
     "height_std": "z_std_m",
     "chord_std": "displacement_std_1s_m",
 }
-_TRACK_DIGITS = {"power": 1, "chord_std": 4}
-"""Decimals that the page shows, where these are not 3."""
+_TRACK_DIGITS = {"power": 1, "chord_std": 4}  # decimals that the page shows, where these are not 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,8 +52,7 @@ _OVER_TIME = (
     "Shaded: excluded, in the colour of the reason. Draw a box to zoom, double-click for the whole run; all plots follow.\n"
     "Where many values share a pixel, the line shows their minimum and maximum."
 )
-_STEP_M = 0.05
-"""Positions of the track that are nearer become one on the map."""
+_STEP_M = 0.05  # positions of the track that are nearer become one on the map
 
 
 def run_report(run: StoredRun, maps: StoredMaps, *, made_from: str = "") -> str:
@@ -241,7 +240,7 @@ def _make_topics_section(manifest: Run) -> PageSection:
 
 
 def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[PageSection]:
-    """Return how many measurements each sensor gave, how many were refused and why, and how well the rest fitted."""
+    """Return, for each sensor, numbers of fused and rejected measurements, with reasons and the mean NIS."""
     counts, nis = (facts.fuse.measurements, facts.fuse.nis_mean) if facts.fuse else ({}, {})
     lost = Counter(zip(rejections.column("role").to_pylist(), rejections.column("reason").to_pylist(), strict=True))
     checks = facts.sensor_checks.excluded if facts.sensor_checks else {}

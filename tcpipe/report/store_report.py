@@ -142,10 +142,10 @@ def name_datasets(datasets: Sequence[StoredDataset]) -> list[str]:
 
 def store_report(content: StoreFacts, tracks: Plot | None = None) -> str:
     """Return the HTML page of a store; with ``tracks`` of few runs on the map, these and the table come first."""
-    every = list_runs(content.state)
-    current = [facts for facts in every if counts(facts, content.state) and facts.ingest_key == content.ruling]
+    all_runs = list_runs(content.state)
+    current = [facts for facts in all_runs if counts(facts, content.state) and facts.ingest_key == content.ruling]
     groups = group_findings((facts.run_id, facts.findings) for facts in current)
-    terms = sorted({term for facts in every for term in facts.physics if not term.startswith("idle")})
+    terms = sorted({term for facts in all_runs for term in facts.physics if not term.startswith("idle")})
     runs = sort_runs(content, groups, terms)
     changes = tuple(compare_batteries((facts.run_id, facts.robot, facts.findings) for facts in current))
     verdict = judge_by_code([*changes, *(finding for facts in current for finding in facts.findings)])

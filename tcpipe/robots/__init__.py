@@ -257,9 +257,9 @@ class Profiles:
 
     def before(self, others: Profiles) -> Profiles:
         """Return these and others: a robot's name and a message type that are here are not taken from there."""
-        mine = set(self.types())
-        there = [source for source in others.power_sources if source.type not in mine]
-        return Profiles({**others.robots, **self.robots}, [*self.power_sources, *there])
+        own_types = set(self.types())
+        kept_sources = [source for source in others.power_sources if source.type not in own_types]
+        return Profiles({**others.robots, **self.robots}, [*self.power_sources, *kept_sources])
 
 
 def parse_fields(text: str) -> list[FieldPath]:

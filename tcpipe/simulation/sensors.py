@@ -227,7 +227,7 @@ class Sensors:
         return replace(self, **{name: replace(getattr(self, name), mounting=Mounting()) for name in names})
 
     def stated(self, faults: Faults, noise: Noise) -> Sensors:
-        """Return mounted sensors as the log of a drive states them: the antenna off by up to its ``stated_off_m``."""
+        """Return the sensors with the extrinsics in the log: those of the antenna err by up to ``stated_off_m``."""
         if self.gnss is None or not faults.gnss_lever_arm:
             return self
         rng, mounting = noise("gnss.stated"), self.gnss.mounting
@@ -297,12 +297,12 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
     covariance[:, [0, 4, 8]] = white_m**2 + lasting_m**2 if known else 0.0
     values = {"lon_deg": lon, "lat_deg": lat, "alt_m": alt, "covariance": covariance, "status": status}
     values["covariance_type"] = np.full(stamp.size, 2 if known else 0, dtype=np.uint8)
-    said = _finish(stamp, sensor.delay_s, values, faults, noise, name="gnss", keep=keep)
+    messages = _finish(stamp, sensor.delay_s, values, faults, noise, name="gnss", keep=keep)
     if not faults.gnss_stamp_jitter:
-        return said
+        return messages
     jitter_s = sensor.stamp_jitter_s * noise("gnss.jitter").standard_normal(stamp.size)
-    row = np.searchsorted(stamp, said.stamp_ns)
-    return replace(said, stamp_ns=said.stamp_ns + np.round(1e9 * jitter_s).astype(np.int64)[row])
+    row = np.searchsorted(stamp, messages.stamp_ns)
+    return replace(messages, stamp_ns=messages.stamp_ns + np.round(1e9 * jitter_s).astype(np.int64)[row])
 
 
 def _make_lasting_noise(count: int, step: float, rng: np.random.Generator) -> Floats:

@@ -106,11 +106,11 @@ def draw_groups(groups: Groups, arrival: Ints, *, test_fraction: float, seed: in
 def _add_test_groups(tests: Mask, free: Ints, sizes: Ints, *, wanted: float) -> None:
     """Add groups in ``free``, sorted by rank, to ``tests`` while that brings their share nearer to ``wanted``."""
     has_samples = sizes > 0
-    taken, left = int(sizes[tests].sum()), int((has_samples & ~tests).sum())
+    taken, remaining = int(sizes[tests].sum()), int((has_samples & ~tests).sum())
     for group in free[~tests[free]].tolist():
-        if left > 1 and abs(taken + sizes[group] - wanted) < abs(taken - wanted):
+        if remaining > 1 and abs(taken + sizes[group] - wanted) < abs(taken - wanted):
             tests[group] = True
-            taken, left = taken + int(sizes[group]), left - 1
+            taken, remaining = taken + int(sizes[group]), remaining - 1
     if wanted > 0 and not tests[has_samples].any() and has_samples.sum() > 1 and len(free):
         tests[free[np.argmin(np.abs(sizes[free] - wanted))]] = True
 

@@ -151,13 +151,13 @@ def compute_nearest_m(queries: Floats, ground: Footprints) -> Floats:
     pending = [(rows, 8) for rows in _split_points(np.arange(len(queries)), _CHUNK)]
     while pending:
         rows, wanted = pending.pop()
-        asked = min(wanted, count)
-        distances_m, j = ground.tree.query(queries[rows].mean(axis=1), k=np.arange(1, asked + 1))
+        count_per_query = min(wanted, count)
+        distances_m, j = ground.tree.query(queries[rows].mean(axis=1), k=np.arange(1, count_per_query + 1))
         near = shapely.polygons(ground.corners_xy_m[ground.rows[j]])
         best_m[rows] = shapely.distance(shapely.polygons(queries[rows])[:, None], near).min(axis=1)
         # squares are nearer than their centres by at most two half diagonals: what is farther still cannot win
         doubtful = rows[(best_m[rows] > np.asarray(distances_m)[:, -1] - reach_m) & (best_m[rows] > 0.0)]
-        if asked < count:
+        if count_per_query < count:
             pending += [(part, 4 * wanted) for part in _split_points(doubtful, max(_CHUNK * 2 // wanted, 1))]
     return best_m
 

@@ -66,20 +66,20 @@ def find_clocks(sections: Sequence[Section]) -> list[Section]:
     is unknown.
     """
     found = [*sections]
-    shown: dict[str, tuple[ClockOffset, str, int]] = {}
-    for place in rank_sections(sections):
-        m = sections[place].measurements
-        clocks = find_clock_offsets(m, clock_epoch=sections[place].clock_epoch)
-        middle_ns = sum(sections[place].span_ns) // 2
+    best_offsets: dict[str, tuple[ClockOffset, str, int]] = {}
+    for index in rank_sections(sections):
+        m = sections[index].measurements
+        clocks = find_clock_offsets(m, clock_epoch=sections[index].clock_epoch)
+        middle_ns = sum(sections[index].span_ns) // 2
         own = {role: (offset, clocks.reference, middle_ns) for role, offset in clocks.offsets.items() if offset.noted}
-        for role in sorted(shown.keys() & m.sensors().keys() - clocks.offsets.keys() - {clocks.reference}):
-            offset, reference, at_ns = shown[role]
+        for role in sorted(best_offsets.keys() & m.sensors().keys() - clocks.offsets.keys() - {clocks.reference}):
+            offset, reference, at_ns = best_offsets[role]
             if offset.drift_ppm:
                 drift_s = offset.drift_ppm * 1e-6 * (middle_ns - at_ns) * 1e-9
                 offset = ClockOffset(0.0, float(np.hypot(offset.std_s, drift_s)), noted=True, blamed=False)
             clocks = replace(clocks, reference=clocks.reference or reference, offsets={**clocks.offsets, role: offset})
-        shown = own | shown
-        found[place] = replace(sections[place], clocks=clocks)
+        best_offsets = own | best_offsets
+        found[index] = replace(sections[index], clocks=clocks)
     return found
 
 

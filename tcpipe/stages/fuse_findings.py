@@ -67,8 +67,8 @@ def find_fuse_findings(inputs: Sequence[Section], facts: FuseFacts, *, run: Subj
     """Return the findings of fusion."""
     first_ns = min((section.start_ns for section in facts.stretches), default=0)
     unused = set.intersection(*(set(section.excluded) for section in inputs))
-    every = (finding for section in inputs for finding in section.findings)
-    findings = [*dict.fromkeys(finding for finding in every if finding.subject.name not in unused)]
+    all_findings = (finding for section in inputs for finding in section.findings)
+    findings = [*dict.fromkeys(finding for finding in all_findings if finding.subject.name not in unused)]
     # Reading already reports a log without fixes.
     if GNSS in facts.set_aside and all(section.datum_deg_m is None for section in inputs):
         findings.append(make_finding("local-frame", Subject("role", GNSS)))

@@ -123,9 +123,13 @@ def _prepare_section(
     tables: Mapping[str, pa.Table], streams: Streams, config: FuseConfig, datum: tuple[float, float, float] | None
 ) -> Section:
     """Return the measurements and findings of a clock epoch, or of a part of it."""
-    every = {role: _prepare(role, part, streams.sensors[role], config, datum) for role, part in tables.items()}
-    prepared: dict[str, Prepared] = {role: each for role, (_, each) in every.items()}
-    found = {role: sensor for role, (sensor, _) in every.items() if sensor is not None and sensor.stamp_ns.size}
+    prepared_by_role = {
+        role: _prepare(role, part, streams.sensors[role], config, datum) for role, part in tables.items()
+    }
+    prepared: dict[str, Prepared] = {role: each for role, (_, each) in prepared_by_role.items()}
+    found = {
+        role: sensor for role, (sensor, _) in prepared_by_role.items() if sensor is not None and sensor.stamp_ns.size
+    }
     findings = [finding for each in prepared.values() for finding in each.findings]
     gnss, odometry, fixes = found.get(GNSS), found.get(WHEELS) or found.get(VISUAL), Subject("role", GNSS)
     if gnss is not None:
@@ -204,16 +208,18 @@ def drop_implausible_sensors(sections: Sequence[Section], streams: Streams) -> l
     """
     stated = ("recipe", "tf_static", "same frame")
     is_imu_stated = IMU in streams.sensors and streams.sensors[IMU].placed_by in stated
-    felt_mps2 = float("nan")
+    force_norm_mps2 = float("nan")
     if IMU in streams.tables:
         force = np.stack([to_floats(streams.tables[IMU], f"linear_acceleration_{axis}_mps2") for axis in "xyz"], -1)
-        felt_mps2 = float(np.median(np.linalg.norm(force, axis=1)))
+        force_norm_mps2 = float(np.median(np.linalg.norm(force, axis=1)))
     judged = list(sections)
     constants: dict[str, SensorExclusion] = {}
     for place in rank_sections(sections):
         roles = sections[place].measurements.sensors()
         section = exclude_sensors(sections[place], [constants[role] for role in constants if role in roles], streams)
-        found = check_sensors(section.measurements, section.command, is_imu_stated=is_imu_stated, felt=felt_mps2)
+        found = check_sensors(
+            section.measurements, section.command, is_imu_stated=is_imu_stated, force_mps2=force_norm_mps2
+        )
         section = exclude_sensors(section, found.values(), streams)
         doubt = check_ground_velocity(section.measurements)
         judged[place] = exclude_sensors(section, [] if doubt is None else [doubt], streams)
@@ -227,11 +233,11 @@ def exclude_sensors(section: Section, exclusions: Iterable[SensorExclusion], str
     """Return a section without the given sensors, with their findings."""
     excluded = {**section.excluded, **{each.role: _find_exclusion(each, section, streams) for each in exclusions}}
     # The receiver's velocity needs the antenna position of the fixes.
-    gone = dict.fromkeys((*excluded, DOPPLER) if GNSS in excluded else excluded)
+    removed = dict.fromkeys((*excluded, DOPPLER) if GNSS in excluded else excluded)
     return replace(
         section,
         datum_deg_m=None if GNSS in excluded else section.datum_deg_m,
-        measurements=section.measurements.replace_sensors(gone),
+        measurements=section.measurements.replace_sensors(removed),
         excluded=excluded,
     )
 

@@ -241,7 +241,7 @@ def find_idle_power(
 
 
 def _step_watt(rails: Mapping[int, list[Rail]]) -> float:
-    """Return the resolution of the power of all rails together [W]; 0 where none shows."""
+    """Return the resolution of the power of all rails together [W]; 0 if none shows."""
     steps = [
         float(np.median(each.voltage_volt)) * estimate_resolution(each.current)
         for each in next((of_epoch for of_epoch in rails.values() if of_epoch), [])

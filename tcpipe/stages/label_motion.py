@@ -87,8 +87,8 @@ def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> Float
     epoch = int(to_integers(cut, "clock_epoch")[0])
     for each in facts.stretches:
         if each.clock_epoch == epoch and IMU in each.sensors and each.gyro_noise_radps is not None:
-            mine = (start_ns >= each.start_ns) & (start_ns <= each.end_ns)
-            density[mine] = 1.5 * each.gyro_noise_radps**2 / rate_hz + PRIORS["imu turn"].variance
+            is_inside = (start_ns >= each.start_ns) & (start_ns <= each.end_ns)
+            density[is_inside] = 1.5 * each.gyro_noise_radps**2 / rate_hz + PRIORS["imu turn"].variance
     return density
 
 
@@ -197,10 +197,10 @@ def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     offsets = (offset for clocks in info.report.facts.clock_offsets for offset in clocks.offsets.values())
-    off, checks = any(offset.noted and not offset.blamed for offset in offsets), info.report.facts.sensor_checks
-    far = checks is not None and "clocks-differ" in checks.excluded.values()
+    has_offset, checks = any(offset.noted and not offset.blamed for offset in offsets), info.report.facts.sensor_checks
+    has_far_clock = checks is not None and "clocks-differ" in checks.excluded.values()
     # A step of all clocks leaves them together.
-    return recorder or off or far or any(step.topics for step in streams.report.facts.clock_steps)
+    return recorder or has_offset or has_far_clock or any(step.topics for step in streams.report.facts.clock_steps)
 
 
 _POWER, _WHEELS = Subject("role", "power"), Subject("role", "wheel_odometry")

@@ -113,14 +113,14 @@ def _fit_power(rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]], margin_
     """Return the power of each clock epoch beside the motion of the track, where both are known for long enough."""
     fits = []
     for epoch, rails in rails_by_epoch.items():
-        mine = select_rows(rows, "clock_epoch", epoch)
+        epoch_rows = select_rows(rows, "clock_epoch", epoch)
         motion = np.column_stack(
-            [to_floats(mine, name) for name in ("forward_velocity_mps", "yaw_rate_radps", "pitch_rad")]
+            [to_floats(epoch_rows, name) for name in ("forward_velocity_mps", "yaw_rate_radps", "pitch_rad")]
         )
         motion[:, 2] = -motion[:, 0] * np.sin(motion[:, 2])  # pitch is positive nose down
         known = np.isfinite(motion).all(axis=1)
         if (power := sum_power(rails)) is not None:
-            stamp_ns, averaged = to_integers(mine, "stamp_ns")[known], any(rail.averaged for rail in rails)
+            stamp_ns, averaged = to_integers(epoch_rows, "stamp_ns")[known], any(rail.averaged for rail in rails)
             fits.append(make_power_fit(power, stamp_ns, motion[known], averaged=averaged, margin_s=margin_s))
     return [fit for fit in fits if fit is not None]
 

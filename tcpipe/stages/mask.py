@@ -88,13 +88,13 @@ def find_outside_windows(track: Track, windows: Sequence[TimeWindow]) -> tuple[M
     """
     stamp_ns, run_id = to_integers(track.table, "stamp_ns"), track.info.run_id
     dropped, kept, empty = np.zeros(len(stamp_ns), bool), np.zeros(len(stamp_ns), bool), 0
-    mine = [window for window in windows if len(stamp_ns) and window.is_for(run_id)]
-    for window in mine:
+    own_windows = [window for window in windows if len(stamp_ns) and window.is_for(run_id)]
+    for window in own_windows:
         start_ns, end_ns = window.find_bounds_ns(int(stamp_ns[0]))
         inside = (stamp_ns >= start_ns) & (stamp_ns < end_ns)
         empty += not inside.any()
         (dropped if window.action == "drop" else kept)[inside] = True
-    if any(window.action == "keep" for window in mine):
+    if any(window.action == "keep" for window in own_windows):
         dropped |= ~kept
     subject = Subject("run", run_id)
     return dropped, (make_finding("time-window-empty", subject, windows_count=empty),) if empty else ()

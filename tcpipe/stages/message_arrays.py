@@ -67,7 +67,7 @@ def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> Arra
 
 
 def _read_nested(lists: pa.Array, path: list[str]) -> Floats | None:
-    """Return a number of every message in lists of messages, shape (N, k); None where there is no such number."""
+    """Return a number of every message in lists of messages, shape (N, k); None if there is no such number."""
     kind = lists.type.value_type if _is_list(lists.type) else pa.null()
     for name in path:
         index = kind.get_field_index(name) if pa.types.is_struct(kind) else -1
@@ -82,7 +82,7 @@ def _read_nested(lists: pa.Array, path: list[str]) -> Floats | None:
 
 
 def _read_text_lists(lists: pa.Array) -> Texts | None:
-    """Return lists of texts, shape (N, k); None where they are no texts."""
+    """Return lists of texts, shape (N, k); None if they are no texts."""
     if not _is_list(lists.type) or not pa.types.is_string(lists.type.value_type):
         return None
     lengths = to_numbers(pc.list_value_length(lists)).astype(np.int64)
@@ -222,9 +222,10 @@ def make_rails(streams: Streams, epoch: int) -> list[Rail]:
     table = select_rows(table, "clock_epoch", epoch)
     rails = []
     for name in names:
-        mine = select_rows(table, "rail", name)
+        rail_rows = select_rows(table, "rail", name)
         signals = (
-            make_samples(to_integers(mine, "stamp_ns"), to_floats(mine, c)) for c in ("voltage_volt", "current_amp")
+            make_samples(to_integers(rail_rows, "stamp_ns"), to_floats(rail_rows, c))
+            for c in ("voltage_volt", "current_amp")
         )
         rails.append(make_rail(name, *signals, averaged=streams.power_averaged))
     return rails

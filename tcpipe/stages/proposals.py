@@ -33,16 +33,16 @@ def find_proposals(log: LogReader, assignment: RoleAssignment, config: ReadConfi
     """Return proposals for roles without a topic that the recipe does not mention. The log is read once."""
     readable = [topic for topic in log.topics.values() if topic.problem is None and topic.message_count != 0]
     free = [of for of in readable if of.name not in config.ignore_topics and not of.name.startswith(OVERLAY)]
-    settled, types = {*assignment.roles, *config.topics}, {topic.type_name for topic in free}
+    assigned, types = {*assignment.roles, *config.topics}, {topic.type_name for topic in free}
     known_types = {*known.types(), *(type_name for types in ROLE_TYPES.values() for type_name in types)}
     of_role = {
         (role, topic): fields
         for role in ("gnss", "imu")  # their field names are unambiguous
-        if role not in settled and not types & set(ROLE_TYPES[role])
+        if role not in assigned and not types & set(ROLE_TYPES[role])
         for topic in free
         if (fields := match_field_names(role, [field for field in list_number_fields(topic) if "[]" not in field]))
     }
-    of_power = [topic for topic in free if "power" not in settled and _may_be_power(topic, known_types)]
+    of_power = [topic for topic in free if "power" not in assigned and _may_be_power(topic, known_types)]
     lists = {
         topic.name: [field for field in [*list_number_fields(topic), "name[]"] if "[]" in field] for topic in of_power
     }
@@ -204,8 +204,8 @@ def _find_bare(bare: Sequence[Topic], columns: Mapping[str, Columns]) -> Iterato
             judged[what].append(found)
     sources, doubt = _pair_rails(judged["voltage"], judged["current"]), "uncomment if these feed the drives"
     if not sources and judged["power"]:
-        alike = split_sides(str(judged["power"][0]["topic"]))[0]
-        sources = [keys for keys in judged["power"] if split_sides(str(keys["topic"]))[0] == alike]
+        name = split_sides(str(judged["power"][0]["topic"]))[0]
+        sources = [keys for keys in judged["power"] if split_sides(str(keys["topic"]))[0] == name]
     elif not sources and not judged["voltage"]:
         sources, doubt = [{**keys, **NOMINAL} for keys in judged["current"]], NO_VOLTAGE
     if topics := [str(keys["topic"]) for judged_keys in judged.values() for keys in judged_keys]:

@@ -48,7 +48,7 @@ def find_read_config(recipe: Recipe, topics: Collection[str]) -> ReadConfig:
 
 
 def decide_roles(config: ReadConfig, topics: Iterable[Topic], robot: str | None, *, known: Profiles) -> RoleAssignment:
-    """Return which topic is used as which role, and why; `RecipeError` where no profile has the robot's name."""
+    """Return which topic is used as which role, and why; `RecipeError` if no profile has the robot's name."""
     assignment = assign_roles(
         topics,
         config.topics,

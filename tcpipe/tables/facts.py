@@ -266,7 +266,7 @@ class Floor:
     """Number of blocks of ground that contain the pairs."""
     std: float
     std_low: float | None
-    """None where there are too few places for an interval."""
+    """None if there are too few places for an interval."""
     std_high: float | None
     share_of_variance: float
     """Share of the label's variance; a model can explain at most the rest."""
@@ -289,7 +289,7 @@ class HeldOut:
     repeated_place_samples: int
     """Those that share ground with a train footprint of another run."""
     nearest_train_min_m: float | None
-    """Distance between the nearest footprints of the two splits [m]; None where one is empty."""
+    """Distance between the nearest footprints of the two splits [m]; None if one is empty."""
     nearest_train_median_m: float | None
     """Median over the held-out samples of the distance to the nearest train footprint [m]."""
 
@@ -337,7 +337,7 @@ class PhysicsFit:
 
 @dataclass(frozen=True, slots=True)
 class PhysicsFacts:
-    """Idle power and physics model of a run (`tcpipe.cost.physics`); None where they cannot be determined."""
+    """Idle power and physics model of a run (`tcpipe.cost.physics`); None if they cannot be determined."""
 
     idle_watt: float | None
     fit: PhysicsFit | None = omit()

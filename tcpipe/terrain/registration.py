@@ -138,7 +138,7 @@ class Registration:
 def register_track(source: MapReader, xy_m: Floats, height_m: Floats) -> Registration | None:
     """Return the horizontal shift at which the map's ground fits the heights of a track best.
 
-    None where fewer than 60 points, half a metre apart, are well inside the map and on its ground.
+    None if fewer than 60 points, half a metre apart, are well inside the map and on its ground.
 
     Parameters
     ----------
@@ -192,11 +192,13 @@ def _find_ground(excess_m: Floats, xy_m: Floats) -> tuple[Mask, Mask]:
     flat_m = excess_m - _fit_tilt(xy_m, excess_m[:, *_MIDDLE])[:, None, None]
     best = _find_least(np.median(np.abs(flat_m - np.median(flat_m, axis=0)), axis=0))
     for _ in range(6):
-        left = excess_m[:, *best] - _fit_tilt(xy_m, excess_m[:, *best])
-        left = np.abs(left - np.median(left))
+        residual_m = excess_m[:, *best] - _fit_tilt(xy_m, excess_m[:, *best])
+        residual_m = np.abs(residual_m - np.median(residual_m))
         row, column = np.clip(best, _NEAR, len(_SHIFT_M) - 1 - _NEAR) - _NEAR
         relief_m = np.ptp(excess_m[:, row : row + 2 * _NEAR + 1, column : column + 2 * _NEAR + 1], axis=(1, 2))
-        near = left - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(left)  # steep ground misfits by a step
+        near = residual_m - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(
+            residual_m
+        )  # steep ground misfits by a step
         good = near & (relief_m < _CLIFF_M)
         if good.sum() < _FEWEST_POINTS:
             return near, near

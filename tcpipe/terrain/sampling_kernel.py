@@ -231,7 +231,7 @@ def _clear(out: Stacks, n: int, good: Mask) -> None:
 
 @compile_kernel
 def _fit_slopes(rise: Floats32, good: Mask, side: int) -> tuple[float, float]:
-    """Return the fitted plane's rise per pixel along and left, by valid pixels; 0 where they span no plane."""
+    """Return the fitted plane's rise per pixel along and left, by valid pixels; 0 if they span no plane."""
     middle = 0.5 * (side - 1)
     count = su = sv = suu = suv = svv = sh = suh = svh = 0.0
     for r in range(side):

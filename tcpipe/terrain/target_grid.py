@@ -80,7 +80,7 @@ class Georeference:
 
 
 def find_projection(raster: Georeference, crs: CRS) -> Projection | None:
-    """Return the operation from a raster's CRS to the map's; None where they are the same."""
+    """Return the operation from a raster's CRS to the map's; None if they are the same."""
     if raster.crs == crs:
         return None
     outline = raster.outline()

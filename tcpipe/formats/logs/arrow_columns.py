@@ -38,8 +38,7 @@ MAX_CONTIGUOUS_BYTES = 1 << 30
 """A larger table stays in pieces: Arrow's lists and strings count their values in 31 bits."""
 
 _TIMES_BYTES, _HEAD_BYTES = 24, 4
-_CDR_HEAD = 0x0100
-"""First two bytes of a message in plain CDR, as an integer: little-endian, version 1."""
+_CDR_HEAD = 0x0100  # first two bytes of a message in plain CDR, as an integer: little-endian, version 1
 _BEFORE_ALL = -(2**63)
 
 LOG_TIME = "log_time_ns"
@@ -71,12 +70,12 @@ class TopicTable:
         self.schema = make_arrow_schema(message_type.wire)
         self._fields = pa.schema(list(self.schema)[2:])
         self.undecodable, self.undecodable_reason = 0, ""
-        """How many messages were left out, and why the first was."""
+        """Number of messages left out, and the reason for the first one."""
         self.replaced_texts = 0
         self.late = 0
-        """Messages that came after a table for later times was taken."""
+        """Number of messages that arrived after the table of later times was returned."""
         self.held_bytes = 0
-        """About how much memory the messages take that no table was taken of yet."""
+        """Approximate memory of the messages that are not in a returned table yet [byte]."""
         self._wire, self._dialect = message_type.wire, ROS1 if encoding == "ros1" else CDR
         self._gathered: list[tuple[_Int64, Bytes, _Int64]] = []
         """Rows of messages, their payloads one after the other, and how long each is."""
@@ -105,10 +104,10 @@ class TopicTable:
             self._flush()
 
     def take(self, *, share: float = 1.0) -> pa.Table:
-        """Return the messages held, sorted by log time (those of equal time in the order of the log), and forget them.
+        """Return and remove the collected messages, sorted by log time (equal times in the order of the log).
 
-        With a ``share`` below 1, about so much of them, the earlier ones: the rest stays, for what comes later but
-        belongs before it.
+        With a ``share`` below 1, return about this share, the earliest ones. The others stay for messages that arrive
+        later but belongs before it.
         """
         self._flush()
         if not self._parts:
@@ -179,7 +178,7 @@ class TopicTable:
         return fits
 
     def _decode(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64) -> None:
-        """Decode messages side by side; those that do not fit their definition are counted and left out."""
+        """Decode messages in parallel columns; messages that do not fit their definition are counted and left out."""
         walked = walk(self._wire, data, starts, ends, self._dialect)
         if walked.root:
             walked_columns = WalkedColumns(data)

@@ -40,8 +40,7 @@ from tcpipe.tables.findings import Subject, make_finding
 _HEAD = b"\xa3\x95"
 _FORMAT, _FORMAT_BYTES = 0x80, 89
 _STRAY_US, _LATE_US = 1_000_000, 3_600 * 10**6
-_WINDOW = 5
-"""Number of successive messages whose median reveals a wrong stamp."""
+_WINDOW = 5  # number of successive messages whose median reveals a wrong stamp
 _MOST_DIGITS, _DEEPEST = 5, 5
 """Most digits of a list's length, and most levels of nested formats [1]; a format with more is damaged."""
 
@@ -178,8 +177,7 @@ _ULOG_TYPES = {
     "char": "S",
 }
 _ULOG_KINDS = frozenset(b"FDIMPQARSOLCB")
-_ULOG_HEAD = struct.Struct("<HBH")
-"""Size and kind of a message, and the number at the start of a data message."""
+_ULOG_HEAD = struct.Struct("<HBH")  # size and kind of a message, and the number at the start of a data message
 _MOST_BYTES = (1 << 16) - 3
 _DATA = ord("D")
 

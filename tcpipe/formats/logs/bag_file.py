@@ -58,7 +58,7 @@ class BagRecord:
         return self.data_offset + self.data_bytes
 
     def number(self, name: bytes) -> int:
-        """Return a little-endian integer field; `DamageError` where it is missing."""
+        """Return a little-endian integer field; `DamageError` if it is missing."""
         if name not in self.fields:
             raise DamageError("record-damaged")
         return int.from_bytes(self.fields[name], "little")
@@ -75,7 +75,7 @@ class ChunkRecords:
     count: int = 0
 
     def messages(self, data: memoryview, wanted: frozenset[int]) -> Messages:
-        """Return the messages of the wanted connections, one connection after the other."""
+        """Return the messages of the requested connections, one connection after the other."""
         numbers = sorted(wanted & self.offsets.keys())
         channel = np.repeat(np.array(numbers, np.int64), [len(self.offsets[number]) for number in numbers])
         offset = np.array([at for number in numbers for at in self.offsets[number]], np.int64)
@@ -163,17 +163,14 @@ def _find_message_fields(header: bytes) -> tuple[int, int]:
 _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MAX_CHUNK_HEADER = 128
 _INDEX_ENTRY_BYTES = 12
-_INDEX_HEAD_BYTES = 64
-"""As much as an index record's header takes as a rule, and the length behind it."""
-_PLACED_AT_ONCE = 1024
-"""Number of chunks whose headers are read together."""
-_EXPECTED_BYTES = 1 << 24
-"""An index is seldom longer, and a broken header may place it anywhere."""
+_INDEX_HEAD_BYTES = 64  # as much as an index record's header takes as a rule, and the length behind it
+_PLACED_AT_ONCE = 1024  # number of chunks whose headers are read together
+_EXPECTED_BYTES = 1 << 24  # an index is seldom longer, and a broken header may place it anywhere
 
 
 @dataclass(frozen=True, slots=True)
 class _Chunk:
-    """A chunk, and how many messages of each connection it contains; ``counts`` is None if only its records show them.
+    """A chunk, and its number of messages by connection; ``counts`` is None if only its records contain them.
 
     ``record`` is the record at ``offset`` (None before it is read, or if it is damaged), ``size`` that of its records
     [byte].
@@ -244,7 +241,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return False
 
     def _placed(self, chunk: _Chunk) -> _Chunk:
-        """Return a chunk with its record and how many bytes its records take; without and 0 where it is broken."""
+        """Return a chunk with its record and the size of its records; no record and size 0 if it is damaged."""
         try:
             record = self._record(chunk.offset)
             size = record.data_bytes if record.codec == "none" else record.number(b"size")

@@ -22,14 +22,13 @@ from tcpipe.logs.topics import Topic
 
 GROUP_BYTES = 1 << 23
 """Total size of chunks that are planned together [byte]."""
-_GAP_BYTES = 1 << 13
-"""Messages no further apart are copied, or read from the disk, in one piece."""
+_GAP_BYTES = 1 << 13  # messages no further apart are copied, or read from the disk, in one piece
 _PLACE_BITS = 40
 MAX_PLANNED_BYTES = (1 << _PLACE_BITS) - 1
 """A larger chunk is not planned, but read on its own."""
 
 Piece = tuple[int, int, int]
-"""Where a piece of a chunk starts and stops in it, and where it is laid."""
+"""Start and stop of a part of a chunk, and its position in the concatenation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +45,7 @@ class Entries:
     log_time_ns: Ints
 
     def at(self, chosen: slice | Ints | Mask) -> Entries:
-        """Return some of them."""
+        """Return the entries of some rows."""
         columns = (self.chunk, self.channel, self.offset, self.end, self.log_time_ns)
         return Entries(*(values[chosen] for values in columns))
 
@@ -73,7 +72,7 @@ class Messages:
     publish_time_ns: Ints
 
     def at(self, chosen: Ints | Mask) -> Messages:
-        """Return some of them."""
+        """Return the entries of some rows."""
         columns = (self.channel, self.offset, self.payload, self.length, self.log_time_ns, self.publish_time_ns)
         return Messages(self.data, *(values[chosen] for values in columns))
 
@@ -104,7 +103,7 @@ class PlacedChunk(Protocol):
 
     @property
     def offset(self) -> int:
-        """Where it begins."""
+        """Offset of its start."""
 
     @property
     def size(self) -> int:
@@ -115,7 +114,7 @@ AnyChunk = TypeVar("AnyChunk", bound=PlacedChunk)
 
 
 class ChunkedPart(LogPart, Generic[AnyChunk]):
-    """A file of chunks, open for reading. Methods raise `DamageError` where a chunk is lost."""
+    """A file of chunks, open for reading. Methods raise `DamageError` if a chunk is lost."""
 
     least_bytes: int
     """No message's record is shorter."""
@@ -136,7 +135,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
 
     @abstractmethod
     def _open(self) -> dict[int, Topic]:
-        """Read the index, or, where it cannot be used, walk the file; return every channel."""
+        """Read the index, or the whole file if the index is unusable; return every channel."""
 
     @abstractmethod
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, AnyChunk]]:
@@ -179,7 +178,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
         """Note the damage of a chunk that is lost as a whole, counted by the index."""
 
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted channels by chunk, or by several chunks if few messages are wanted."""
+        """Yield the messages of the requested channels by chunk, or by several chunks if few messages are wanted."""
         chunks = self.chunks_with(wanted)
         for group in group_chunks(chunk.size for _, chunk in chunks):
             members = chunks[group.start : group.stop]
@@ -252,8 +251,8 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
             return
         if entries is not None:
             held = messages.at(np.argsort(messages.offset, kind="stable"))
-            mine = np.stack([held.offset, held.channel, held.log_time_ns])
-            if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
+            from_records = np.stack([held.offset, held.channel, held.log_time_ns])
+            if np.array_equal(from_records, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
                 return
             lost = max(len(entries.offset) - len(held.offset), 0)
         self._note("chunk-index-damaged", chunk.offset, messages_lost=0 if self.is_proved(chunk) else lost or None)

@@ -329,7 +329,7 @@ class Log(OpenLog):
         return text, found.source
 
     def table(self, topic: str) -> pa.Table:
-        """Return one topic's messages; `LogError` where the topic is unknown or cannot be decoded."""
+        """Return one topic's messages; `LogError` if the topic is unknown or cannot be decoded."""
         tables = self.tables([topic])
         if topic not in tables:
             raise LogError(f"{self.path}: topic {topic} cannot be read: {self._message_type(topic)}")
@@ -394,8 +394,8 @@ class Log(OpenLog):
         wanted = list(dict.fromkeys(topics))
         unknown = [name for name in wanted if name not in self.topics]
         if unknown:
-            there = ", ".join(sorted(self.topics)) or "no topics"
-            raise LogError(*(f"{self.path}: there is no topic {name}; it has {there}" for name in unknown))
+            known_topics = ", ".join(sorted(self.topics)) or "no topics"
+            raise LogError(*(f"{self.path}: there is no topic {name}; it has {known_topics}" for name in unknown))
         types, columns = dict[str, MessageType](), 0
         for name in wanted:
             found = self._message_type(name)
@@ -491,7 +491,7 @@ class Log(OpenLog):
 def _open_directory(
     directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]
 ) -> tuple[Rosbag2Files, list[LogPart]]:
-    """Open the files of a ROS 2 bag; one that cannot be opened costs only itself."""
+    """Open the files of a ROS 2 bag; files that cannot be opened are recorded as damage."""
     try:
         found = find_rosbag2_files(directory)
     except LogError as error:

@@ -29,8 +29,7 @@ from tcpipe.tables.findings import Finding, Subject, make_finding
 _PART = re.compile(r"(?P<name>.+)_(?P<number>[0-9]{1,6})\.bag(\.active)?")
 _DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){5}")
 _STATIC = "tf_static"
-_GAP_NS = 5_000_000_000
-"""Longest time between two parts of one log [ns]."""
+_GAP_NS = 5_000_000_000  # longest time between two parts of one log [ns]
 
 
 class JoinedLog(OpenLog):
@@ -53,7 +52,7 @@ class JoinedLog(OpenLog):
 
     @property
     def outline(self) -> str:
-        """A hash of the indexes of all files; "" where one has none."""
+        """A hash of the indexes of all files; "" if one has none."""
         outlines = [log.outline for log in self._logs]
         if not all(outlines):
             return ""
@@ -101,11 +100,11 @@ class JoinedLog(OpenLog):
 
 
 def _require_same_fields(topic: str, first: pa.Schema, other: pa.Schema) -> None:
-    """Raise `LogError` where the messages of a topic have other fields in another file."""
+    """Raise `LogError` if the messages of a topic have other fields in another file."""
     if first != other:
-        odd = sorted({field.name for field in set(first) ^ set(other)})
+        differing = sorted({field.name for field in set(first) ^ set(other)})
         raise LogError(
-            f"topic {topic}: its messages have other fields in one of the files given with --as-one ({', '.join(odd)}); "
+            f"topic {topic}: its messages have other fields in one of the files given with --as-one ({', '.join(differing)}); "
             "ingest them apart"
         )
 
@@ -162,7 +161,7 @@ def open_single_log(
 
 
 def _find_earlier_part(log: Log) -> Log | None:
-    """Return the nearest earlier part that has static transforms, open; None where the chain of parts breaks before."""
+    """Return the nearest earlier part that has static transforms, open; None if the chain of parts breaks before."""
     part: Log | None = log
     while part is not None:
         before = _find_part_before(part)

@@ -38,12 +38,10 @@ _SEARCH_BYTES = 1 << 20
 
 _PEEK_BYTES = 1 << 13
 
-_BLOCK_BYTES = 1 << 13
-"""Fetched ranges begin and end at multiples of this [byte]."""
+_BLOCK_BYTES = 1 << 13  # fetched ranges begin and end at multiples of this [byte]
 _HELD_BLOCKS = (1 << 26) // _BLOCK_BYTES
 """Size of the buffer of fetched ranges [byte]: larger than a group of chunks that is planned together."""
-_GAP_BLOCKS = 4
-"""Blocks no further apart are fetched as one piece: a request costs as much as some."""
+_GAP_BLOCKS = 4  # blocks no further apart are fetched as one piece: a request costs as much as some
 
 
 class DamageError(Exception):
@@ -149,7 +147,7 @@ class FetchedFile:
             self._held.clear()
 
     def _blocks(self, numbers: Collection[int]) -> dict[int, memoryview]:
-        """Return blocks by number; those that are not held are fetched."""
+        """Return blocks by number, and fetch missing ones."""
         found = {number: self._held[number] for number in numbers if number in self._held}
         for number in found:
             self._held.move_to_end(number)
@@ -187,7 +185,7 @@ class ByteSource:
         self._peeked = 0, b""
 
     def read(self, offset: int, size: int) -> memoryview:
-        """Return ``size`` bytes at ``offset``; raise `DamageError` where the file ends before."""
+        """Return ``size`` bytes at ``offset``; raise `DamageError` if the file ends before."""
         if size < 0 or offset + size > self.size:
             raise DamageError("file-cut")
         data = self._some(offset, size)

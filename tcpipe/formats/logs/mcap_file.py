@@ -50,8 +50,7 @@ from tcpipe.formats.logs.mcap_records import (
 )
 from tcpipe.logs.topics import Topic, compute_silence_ns, normalize_type_name
 
-_LOOSE_BYTES = 1 << 22
-"""Messages outside chunks are read in runs of about this size."""
+_LOOSE_BYTES = 1 << 22  # messages outside chunks are read in runs of about this size
 
 
 class McapPart(ChunkedPart[Chunk]):
@@ -62,7 +61,7 @@ class McapPart(ChunkedPart[Chunk]):
 
     def _open(self) -> dict[int, Topic]:
         self._tallies: dict[int, tuple[int, int, int]] = {}
-        """By channel, how many messages a walk met, the first and the last log time."""
+        """By channel: number of messages found by reading records, first and last log time."""
         self._untimed = 0
         self._complete = False
         try:
@@ -87,7 +86,7 @@ class McapPart(ChunkedPart[Chunk]):
         return {number: self._topic(number) for number in sorted(self._contents.channels)}
 
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted channels."""
+        """Yield the messages of the requested channels."""
         if not self._complete:
             self._fill_gaps()
         yield from super().blocks(wanted)
@@ -112,7 +111,7 @@ class McapPart(ChunkedPart[Chunk]):
         return messages, right & same & (messages.length <= room)
 
     def _step_through(self, chunk: Chunk, data: memoryview) -> tuple[Ints, int]:
-        """Return where the records of a chunk begin, and where they end."""
+        """Return start and end of the records of a chunk."""
         records, end = record_offsets(data, self._bounds.most_records)
         self._bounds.walk(chunk.offset, len(records))
         return records, end
@@ -256,7 +255,7 @@ class McapPart(ChunkedPart[Chunk]):
         return False
 
     def _take_loose_messages(self, position: int, end: int) -> int:
-        """Take messages outside chunks that follow one another as if they were a chunk; return where they end."""
+        """Treat consecutive messages outside chunks as a chunk; return the offset of their end."""
         after = position
         with suppress(DamageError):
             while after - position <= _LOOSE_BYTES and after + RECORD_HEAD <= end:
@@ -311,7 +310,7 @@ class McapPart(ChunkedPart[Chunk]):
         self._contents.chunks[-1] = replace(chunk, index=index, index_bytes=index_bytes)
 
     def _distrust_last_index(self) -> None:
-        """Forget the index of the last chunk: where the file breaks off behind it, some of it may be missing."""
+        """Discard the index of the last chunk: if the file is truncated after it, the index may be incomplete."""
         if self._contents.chunks:
             self._contents.chunks[-1] = replace(self._contents.chunks[-1], index=None)
 
@@ -422,7 +421,7 @@ class McapPart(ChunkedPart[Chunk]):
         self._tallies[channel] = known + count, min(start_ns, first_ns), max(end_ns, last_ns)
 
     def note_lost(self, chunk: Chunk, error: DamageError) -> None:
-        """Note the damage of a chunk that is lost as a whole, counted by the message index beside it."""
+        """Record the loss of a whole chunk, with the number of messages in its message index."""
         try:
             lost = sum(len(self._index_entries(at, channel)) for channel, at in (chunk.index or {}).items())
         except DamageError:

@@ -69,7 +69,7 @@ class ChannelRecord:
 class Chunk:
     """Place and content of a chunk; messages outside chunks are one without a head (``crc`` 0, no compression).
 
-    ``index`` gives the byte of each channel's message index (None where the chunk has none), ``index_bytes`` how long
+    ``index`` gives the byte of each channel's message index (None if the chunk has none), ``index_bytes`` how long
     they are together.
     """
 
@@ -106,7 +106,7 @@ class Statistics:
 
 
 class FieldReader:
-    """Reads the fields of one record in order; raises `DamageError` where they do not fit."""
+    """Reads the fields of one record in order; raises `DamageError` if they do not fit."""
 
     def __init__(self, content: bytes | memoryview) -> None:
         self._content = content
@@ -251,10 +251,8 @@ def find_message_offsets(data: memoryview, records: Ints) -> Ints:
     return messages[gather_integers(data, messages + 1, "i8") >= MESSAGE_HEAD] if len(messages) else messages
 
 
-_DATA_END = RECORD_HEAD + 4
-"""Bytes of the record that ends the data, right before the summary."""
-_SUMMARY_BYTES = 1 << 16
-"""A summary is seldom longer."""
+_DATA_END = RECORD_HEAD + 4  # bytes of the record that ends the data, right before the summary
+_SUMMARY_BYTES = 1 << 16  # A summary is seldom longer
 
 
 @dataclass(slots=True)

@@ -54,7 +54,7 @@ class TableLog(OpenLog):
         return hash_files(self.files, self.size_bytes)
 
     def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
-        """Return the messages of several topics; `LogError` where one is not in the log."""
+        """Return the messages of several topics; `LogError` if one is not in the log."""
         return {name: table for tables in self.batches(topics) for name, table in tables.items()}
 
     first_rows = tables

@@ -111,7 +111,7 @@ class TypeLibrary:
     def find_type(
         self, type_name: str, *, definition: str, schema_encoding: str, ros1: bool
     ) -> MessageType | DefinitionError:
-        """Return the type for a definition text ("" where the log has none).
+        """Return the type for a definition text ("" if the log has none).
 
         An error is returned, not raised, where no definition is known, or it cannot be parsed, is recursive, or uses a
         type no reader supports.

@@ -27,8 +27,7 @@ MAX_METADATA_BYTES = 1 << 20
 
 _COPY_BYTES = 1 << 22
 _LISTED = 10
-_PART = re.compile(r"(_\d+)?\.(db3|mcap)(\.zstd)?$")
-"""End of the names of a bag's files, in which they differ."""
+_PART = re.compile(r"(_\d+)?\.(db3|mcap)(\.zstd)?$")  # end of the names of a bag's files, in which they differ
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +115,8 @@ def list_storage_files(directory: Path) -> tuple[Path, ...]:
 
 
 def _list_storage_names(directory: Path) -> list[str]:
-    with os.scandir(directory) as there:
-        named = [entry for entry in there if entry.name.endswith(STORAGE_SUFFIXES) and not entry.name.startswith(".")]
+    with os.scandir(directory) as entries:
+        named = [entry for entry in entries if entry.name.endswith(STORAGE_SUFFIXES) and not entry.name.startswith(".")]
         return [entry.name for entry in named if entry.is_file()]
 
 

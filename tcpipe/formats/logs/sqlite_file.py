@@ -26,15 +26,13 @@ _HEADER_BYTES = 100
 _BLOCK_ROWS, _BLOCK_BYTES = 4096, 1 << 23
 """Most rows of a block, and its size after which no row is added [byte]."""
 _BEFORE_ALL, _LAST_ID = -1e19, 2**63 - 1
-_MOST_HOLES = 1000
-"""Most damaged ranges after which reading of a file ends: the end of each is searched."""
+_MOST_HOLES = 1000  # most damaged ranges after which reading of a file ends: the end of each is searched
 _LONGEST_BYTES, _ROW_BYTES = 1 << 28, 1 << 10
 """SQLite refuses a row that claims to be longer, or longer than its file: a chain of pages may lead back to itself."""
 _TABLES = ("topics", "messages", "message_definitions")
 _BROKEN = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 """Errors of a damaged database; the second if its message has a damaged name, the third if a row is endless."""
-_Row = tuple[int, int, int, int, bytes]
-"""Row id, topic, log time, publish time, data."""
+_Row = tuple[int, int, int, int, bytes]  # row id, topic, log time, publish time, data
 
 
 class SqlitePart(LogPart):
@@ -63,12 +61,12 @@ class SqlitePart(LogPart):
             self.close()
             why = describe_full_disk(error) or error.strerror
             raise LogError(
-                f"{path}: it cannot be read, or copied to be read ({why}); tcpipe reads nothing of it"
+                f"{path}: it cannot be read, or copied to be read ({why}); tcpipe does not read it"
             ) from None
         except _BROKEN as error:
             self.close()
             raise LogError(
-                f"{path}: its table of topics cannot be read ({_describe_error(error)}); tcpipe reads nothing of it"
+                f"{path}: its table of topics cannot be read ({_describe_error(error)}); tcpipe does not read it"
             ) from None
 
     def close(self) -> None:
@@ -76,7 +74,7 @@ class SqlitePart(LogPart):
         self._opened.close()
 
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted topics in the order of their ids, some thousand rows at a time."""
+        """Yield the messages of the requested topics in the order of their ids, some thousand rows at a time."""
         topics = sorted(wanted & self.channels.keys())
         if not topics:
             return
@@ -127,7 +125,7 @@ class SqlitePart(LogPart):
         for name, kind, root in self._database.execute(query, _TABLES):
             computed = any(hidden for *_, hidden in self._database.execute(f"PRAGMA table_xinfo({name})"))
             if kind != "table" or not root or computed:
-                raise LogError(f"{path}: its {name!r} is no plain table; tcpipe reads nothing of it")
+                raise LogError(f"{path}: its {name!r} is no plain table; tcpipe does not read it")
 
     def _channels(self, path: Path) -> dict[int, Topic]:
         rows = self._database.execute(

@@ -15,8 +15,7 @@ from tcpipe.recipe import TableMapping
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tum", ".pos", ".parquet")
 """Suffixes of tables."""
 
-_DATASET = {"dataset.json", "samples.parquet"}
-"""Files that identify a folder as a dataset."""
+_DATASET = {"dataset.json", "samples.parquet"}  # files that identify a folder as a dataset
 
 Mappings = Mapping[str, TableMapping]
 """The recipe's tables, by name."""
@@ -68,7 +67,7 @@ def find_table_logs(path: Path, mappings: Mappings) -> list[tuple[Path, ...]]:
 
 
 def find_table_run(path: Location, mappings: Mappings) -> TableRun | None:
-    """Return the run that a table belongs to by its name, None where the recipe maps no file of such a name.
+    """Return the run that a table belongs to by its name, None if the recipe maps no file of such a name.
 
     The tables of a run are in one folder; the text of a ``*`` is the same in the names of all of them.
     """

@@ -1,7 +1,7 @@
 """A folder of tables as a log: each mapped table is a topic, and its rows are messages as its role usually has.
 
-Behind the same face as a bag: topics, tables of messages, damage. All of it is read when it is opened; it is small
-beside a bag.
+It has the interface of a bag: topics, tables of messages, damage. All tables are read when it is opened: they are small
+compared with a bag.
 
 Tables that others wrote, as CSV, text in columns (TUM trajectories, RTKLIB's .pos) or Parquet: polars' lazy scan,
 columns by name.
@@ -250,8 +250,8 @@ def _collect_columns(
 def _find_non_number(path: Path, name: str) -> tuple[int, int, str] | None:
     """Return the number of cells that are no numbers, and row (from 1) and text of the first."""
     texts = _collect_columns(path, [name], numbers=None)[name].cast(pl.String)
-    odd = texts.is_not_null() & (texts.str.strip_chars() != "") & texts.cast(pl.Float64, strict=False).is_null()
-    rows = odd.arg_true()
+    is_invalid = texts.is_not_null() & (texts.str.strip_chars() != "") & texts.cast(pl.Float64, strict=False).is_null()
+    rows = is_invalid.arg_true()
     return (len(rows), int(rows[0]) + 1, str(texts[int(rows[0])])) if len(rows) else None
 
 
@@ -274,7 +274,7 @@ def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '
         lines[0].decode()
     except UnicodeDecodeError:  # as spreadsheets write it
         source = BytesIO(path.read_bytes().decode("cp1252", errors="replace").encode())
-    if separator == b" ":  # several of them are one
+    if separator == b" ":  # several separators count as one
         text = _SPACES.sub(b" ", _DAY_AND_TIME.sub(rb"\1-\2-\3T", path.read_bytes().replace(b"\r", b"")))
         source = BytesIO(_EDGES.sub(b"", text))
     return pl.scan_csv(

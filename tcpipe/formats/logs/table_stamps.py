@@ -21,8 +21,7 @@ _FORMS = (
     "%H:%M:%S%.f",
 )
 """Formats of dates and times that are recognised; the last has no date."""
-_GPS_TIME = "GPST"
-"""RTKLIB's name of a column of GPS time."""
+_GPS_TIME = "GPST"  # RTKLIB's name of a column of GPS time
 _OF_UTC = re.compile(r"(.*_)?(utc|gmt|zulu)(_.*)?")
 _OF_DAY = re.compile(r"(.*_)?ms_(today|of_day)")
 _COUNTERS = {"millis": "ms", "micros": "us", **{unit: unit for unit in STAMP_UNITS}}
@@ -30,16 +29,14 @@ _COUNTERS = {"millis": "ms", "micros": "us", **{unit: unit for unit in STAMP_UNI
 _DATE_IN_NAME = re.compile(r"(?<!\d)(20\d\d)([-_.]?)([01]\d)\2([0-3]\d)(?!\d{3})")
 _DAY_NS = 86_400_000_000_000
 _SAMPLE_ROWS = 1000
-_SLOWEST_STEP_S = 6.0
-"""Ten rows in a minute: the unit of a counter is the coarsest with shorter steps."""
+_SLOWEST_STEP_S = 6.0  # ten rows in a minute: the unit of a counter is the coarsest with shorter steps
 _MIN_FAST_SHARE = 0.9
 _PREFERRED = ("counter", "day", "local", "utc")
 _MAX_TIE_SPREAD_NS, _MAX_STRAY_SHARE = 2_000_000_000, 0.05
 _COARSEST = tuple(reversed(STAMP_UNITS.items()))
 _REPEATED_HOUR: tuple[Literal["earliest", "latest"], ...] = ("earliest", "latest")
 """Which of two equal local times is meant at the end of summer time, before and after the clock was set back."""
-_LONGEST_STEP_BACK = timedelta(minutes=30)
-"""A larger step back in a table sets the clock back."""
+_LONGEST_STEP_BACK = timedelta(minutes=30)  # A larger step back in a table sets the clock back
 _NO_STAMPS = "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
 RecipeKeys: TypeAlias = dict[str, tuple[str, str, bool]]
 """By key of a table of the recipe its value, a note, and whether it is certain."""
@@ -231,13 +228,13 @@ def _convert_to_utc(clock: Clock, zone: str, stated: str, path: Path) -> Clock |
 
 def _tie_to_utc(clock: Clock, utc: Clock) -> Clock | str:
     """Return stamps shifted onto UTC by a coarser column: by the median over the rows in which that column changes."""
-    apart = (utc.ns - clock.ns).set(utc.ns <= int(YEARS_S[0] * 1e9), None)
-    at_changes = apart.filter((utc.ns.diff() != 0) & apart.is_not_null())
-    apart = at_changes if len(at_changes) else apart.drop_nulls()
-    if not len(apart):
+    differences = (utc.ns - clock.ns).set(utc.ns <= int(YEARS_S[0] * 1e9), None)
+    at_changes = differences.filter((utc.ns.diff() != 0) & differences.is_not_null())
+    differences = at_changes if len(at_changes) else differences.drop_nulls()
+    if not len(differences):
         return "stamp_utc has no times since 1979"
-    offset = int(np.median(apart.to_numpy()))
-    share = float(np.mean(np.abs(apart.to_numpy() - offset) > _MAX_TIE_SPREAD_NS))
+    offset = int(np.median(differences.to_numpy()))
+    share = float(np.mean(np.abs(differences.to_numpy() - offset) > _MAX_TIE_SPREAD_NS))
     notes = (f"{share:.0%} of its UTC stamps are 2 s or more from the others",) if share > _MAX_STRAY_SHARE else ()
     return replace(clock, kind="utc", ns=clock.ns + offset, notes=(*utc.notes, *notes))
 

@@ -188,10 +188,10 @@ def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Ra
         return scheme, origin
     named = find_named_scheme(terrain.names, scheme.table)
     if named is None:
-        theirs = ", ".join(dict.fromkeys(terrain.names.values()))
-        ours = ", ".join(entry.name for entry in scheme.table.classes)
+        raster_names = ", ".join(dict.fromkeys(terrain.names.values()))
+        table_names = ", ".join(entry.name for entry in scheme.table.classes)
         raise MapError(
-            f"{terrain.georeference.name}: none of its class names ({theirs}) is in the class table ({ours}); "
+            f"{terrain.georeference.name}: none of its class names ({raster_names}) is in the class table ({table_names}); "
             "define them with --classes"
         )
     return named, "names"

@@ -7,7 +7,7 @@ Virtual rasters (VRT), which name other files, are not supported.
 A raster is opened *for a role* (height, ortho, terrain, or a layer of the user's) and refused at once, in one line, if
 it cannot play it: no place on the earth, placed by control points only, wrong bands, wrong numbers. Pixel-is-point
 tags, south-up and rotated affines, scale and offset tags, units, palettes, alpha, mask bands, nodata tags and NaN are
-dealt with here; what leaves is metres, grey from 0 to 255, or raw class values, each with a mask.
+handled here; the results are metres, grey from 0 to 255, or raw class values, each with a mask.
 """
 
 import logging
@@ -89,22 +89,18 @@ _OTHERS = {
 }
 """Kinds of files by their first bytes; GDAL reads most of them as rasters."""
 
-_VRT = b"<VRTDataset"
-"""By which GDAL knows a virtual raster, in the first bytes of a file of any name."""
+_VRT = b"<VRTDataset"  # by which GDAL knows a virtual raster, in the first bytes of a file of any name
 
 _REDIRECTIONS = ("OVERVIEWS", "ProxyOverviewRequest")
 """Domains of tags, in a GeoTIFF or in its statistics file, that make GDAL open another file, or an address."""
 
-_MAX_OPEN = 32
-"""Files that are open at one time."""
+_MAX_OPEN = 32  # files that are open at one time
 
-_MAX_BLOCK_BYTES = 256_000_000
-"""Largest block that is decoded at one time: a tile or a strip of a raster [byte]."""
+_MAX_BLOCK_BYTES = 256_000_000  # largest block that is decoded at one time: a tile or a strip of a raster [byte]
 
 _MAX_STATISTICS_BYTES = 16_000_000
 
-_OPAQUE = 1
-"""Least mask or alpha of a valid pixel; 16-bit alpha is often written as 255, which is almost transparent."""
+_OPAQUE = 1  # least mask or alpha of a valid pixel; 16-bit alpha is often written as 255, which is almost transparent
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,10 +184,10 @@ def read_window(  # noqa: PLR0917
 def _read_whole_numbers(tile: Tile, values: AnyArray, valid: Mask) -> AnyArray:
     """Return class values that are stored as floats; `MapError` for one that is no whole number."""
     whole = np.where(valid, values, 0.0)
-    odd = whole[(whole != np.rint(whole)) | (np.abs(whole) > np.iinfo(tile.dtype).max)]
-    if odd.size:
+    invalid = whole[(whole != np.rint(whole)) | (np.abs(whole) > np.iinfo(tile.dtype).max)]
+    if invalid.size:
         raise MapError(
-            f"{tile.path}: {tile.role} has the value {odd[0]:g}, expected whole numbers; if classes were interpolated, transform the "
+            f"{tile.path}: {tile.role} has the value {invalid[0]:g}, expected whole numbers; if classes were interpolated, transform the "
             "original raster: rio warp in.tif out.tif --like height.tif --resampling nearest"
         )
     return whole.astype(tile.dtype)
@@ -338,7 +334,7 @@ def _rewrite(path: Path) -> str:
 
 
 def _open(path: Path, driver: str) -> Any:
-    logging.getLogger("rasterio").addHandler(logging.NullHandler())  # GDAL's own lines come with our error
+    logging.getLogger("rasterio").addHandler(logging.NullHandler())  # the error of tcpipe contains GDAL's lines
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:

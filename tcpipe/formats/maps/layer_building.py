@@ -29,8 +29,7 @@ from tcpipe.terrain.target_grid import LATTICE_STEP_PX, Georeference, MapGrid, c
 MAX_FILES = 100_000
 """Most files of one layer."""
 
-_OFF_GRID_PX = 0.05
-"""Largest offset of a tile's corners from the pixels of the others for one common grid [px]."""
+_OFF_GRID_PX = 0.05  # largest offset of a tile's corners from the pixels of the others for one common grid [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +87,7 @@ class Raster:
 def open_raster(paths: Sequence[Path], role: str, use: Use, open_file: OpenFile, crs: CRS | None = None) -> Raster:
     """Return the tiles of a role in drawing order, the last on top; ``crs`` is that of tiles without one.
 
-    `MapError`: one of them cannot play the role, or they are not of one kind and one grid, or have no CRS.
+    `MapError`: a file cannot be used as the role, the files differ in kind or grid, or have no CRS.
     """
     label = label_files(paths)
     if len(paths) > MAX_FILES:
@@ -141,14 +140,14 @@ def _find_crs_keys(tiles: Sequence[Tile]) -> list[str]:
 
 
 def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: str) -> None:
-    """Refuse tiles that differ from the most of them, and name these."""
+    """Raise `MapError` for tiles that differ from most tiles, with their names."""
     usual = Counter(keys).most_common(1)[0][0]
-    odd = [(tile, key) for tile, key in zip(tiles, keys, strict=True) if key != usual]
-    if odd:
-        names = ", ".join(shorten_problems([str(tile.path) for tile, _ in odd]))
-        got, wanted = ((CRS(key).name if key else "none") if what == "CRS" else key for key in (odd[0][1], usual))
+    wrong = [(tile, key) for tile, key in zip(tiles, keys, strict=True) if key != usual]
+    if wrong:
+        names = ", ".join(shorten_problems([str(tile.path) for tile, _ in wrong]))
+        got, wanted = ((CRS(key).name if key else "none") if what == "CRS" else key for key in (wrong[0][1], usual))
         raise MapError(
-            f"{tiles[0].role}: {len(odd)} of {len(tiles)} files have another {what} than the rest ({got}, expected {wanted}): {names}; "
+            f"{tiles[0].role}: {len(wrong)} of {len(tiles)} files have another {what} than the rest ({got}, expected {wanted}): {names}; "
             f"write them like the rest: {mended}"
         )
 
@@ -161,12 +160,14 @@ def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, fl
     if off.sum() > len(tiles) / 2:  # the first tile is the different one
         base = next((n for n in np.flatnonzero(off).tolist() if pixels[n] == pixels[base]), base)
         at, off = _find_grid_positions(tiles, base)
-    odd = [tile for tile, far in zip(tiles, off, strict=True) if far]
-    if odd:
-        got, wanted = (f"{abs(tile.affine[0]):.6g} x {abs(tile.affine[4]):.6g}" for tile in (odd[0], tiles[base]))
+    misaligned = [tile for tile, far in zip(tiles, off, strict=True) if far]
+    if misaligned:
+        got, wanted = (
+            f"{abs(tile.affine[0]):.6g} x {abs(tile.affine[4]):.6g}" for tile in (misaligned[0], tiles[base])
+        )
         raise MapError(
-            f"{tiles[0].role}: {len(odd)} of {len(tiles)} files are not aligned with the pixels of the others "
-            f"({got}, the rest {wanted}): {', '.join(shorten_problems([str(tile.path) for tile in odd]))}; "
+            f"{tiles[0].role}: {len(misaligned)} of {len(tiles)} files are not aligned with the pixels of the others "
+            f"({got}, the rest {wanted}): {', '.join(shorten_problems([str(tile.path) for tile in misaligned]))}; "
             f"put all on one grid: rio merge --resampling {'nearest' if tiles[0].use == 'classes' else 'bilinear'} "
             f"--nodata {-9999 if tiles[0].use == 'metres' else 0} *.tif joined.tif"
         )
@@ -206,15 +207,12 @@ def _join_value_names(tiles: Sequence[Tile]) -> dict[int, str]:
 
 _BLOCK_PX = 1024
 _HIGHEST_M = 9_000.0
-_DEEPEST_M = -500.0
-"""Lowest and highest dry land [m]."""
-_MEAN_FROM = 1.5
-"""Fewest source pixels per map pixel for averaging a layer; with fewer it is interpolated."""
+_DEEPEST_M = -500.0  # lowest and highest dry land [m]
+_MEAN_FROM = 1.5  # fewest source pixels per map pixel for averaging a layer; with fewer it is interpolated
 _LISTED = 8
 _NAMED = 3
 _ISOLATED, _NARROW = "value-isolated", "ortho-range-narrow"
-_TAIL = 0.001
-"""Share of the darkest, and of the brightest, pixels of an orthophoto outside the range that counts."""
+_TAIL = 0.001  # share of the darkest, and of the brightest, pixels of an orthophoto outside the range that counts
 
 
 @dataclass(slots=True)
@@ -295,7 +293,7 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class RasterLayer:
-    """A raster as a layer; ``projection`` is from its CRS to the grid's, None where they are the same."""
+    """A raster as a layer; ``projection`` is from its CRS to the grid's, None if they are the same."""
 
     layer: Layer
     raster: Raster
@@ -333,7 +331,7 @@ class RasterLayer:
         return replace(self, raster=self.raster.thin(int(max(ratio // _PICTURE_TAPS, 1.0))))
 
     def explain_no_class(self) -> str | None:
-        """Return the problem that none of its values is a class; None where some are."""
+        """Return the problem that none of its values is a class; None if some are."""
         if not self.tally.unnamed or self.scheme is None:
             return None
         option = "--classes" if self.layer.name == "terrain" else f"--categorical {self.layer.name}=FILE"
@@ -455,7 +453,7 @@ def draw_colours(ortho: RasterLayer, side_px: int) -> Bytes | None:
 
 
 def _compute_source_px_per_px(lattice: Floats) -> float:
-    """Return how many source pixels a map pixel spans, the longer way; NaN where the raster's CRS is not defined."""
+    """Return the number of source pixels per map pixel along the longer side; NaN if the CRS is undefined there."""
     across = np.linalg.norm(lattice[0, 1] - lattice[0, 0])
     down = np.linalg.norm(lattice[1, 0] - lattice[0, 0])
     return float(max(across, down)) / LATTICE_STEP_PX

@@ -79,8 +79,7 @@ class InspectedMap(MapSummary):
     path: str
 
 
-_SHARES = 5
-"""Classes that a line lists by their share, commonest first."""
+_SHARES = 5  # classes that a line lists by their share, commonest first
 
 
 def map_lines(summary: MapSummary) -> list[str]:
@@ -119,8 +118,7 @@ def _format_percent(share: float) -> str:
     return ">99 %" if 99.5 <= percent < 100.0 else f"{percent:.0f} %"
 
 
-_VALUE_USAGES = ("5", "3")
-"""GDAL's GFU_MinMax, GFU_Min: the column of the value (or of the start of a range)."""
+_VALUE_USAGES = ("5", "3")  # GDAL's GFU_MinMax, GFU_Min: the column of the value (or of the start of a range)
 _UPPER_USAGE = "4"
 _NAME_USAGE = "2"
 _STRING_TYPE = "2"
@@ -160,7 +158,7 @@ def _read_table_names(table: Element) -> dict[int, str]:
 
 
 def _parse_single_value(row: Sequence[str], column: int, uppers: Sequence[int]) -> int | None:
-    """Return the one integer that a row is about; None where it is about a range or a fraction."""
+    """Return the one integer that a row is about; None if it is about a range or a fraction."""
     try:
         value = float(row[column])
         upper = float(row[uppers[0]]) if uppers else value

@@ -97,7 +97,7 @@ class _Attributes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapFile(MapReader):
-    """An open map; `read` and `read_tile` raise `MapError` where a tile is damaged."""
+    """An open map; `read` and `read_tile` raise `MapError` if a tile is damaged."""
 
     facts: MapFacts
     id_by_value: Mapping[int, int]

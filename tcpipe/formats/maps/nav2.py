@@ -28,8 +28,7 @@ LETHAL = 100
 HIGHEST = 98
 """Largest cost of cells that can be crossed: static layers read 99 as inscribed, which is an obstacle."""
 
-_OCCUPIED = 0.995
-"""Between the darkest grey of `HIGHEST` and black."""
+_OCCUPIED = 0.995  # between the darkest grey of `HIGHEST` and black
 
 
 def write_nav2_map(path: Path, cost: Bytes, grid: MapGrid, *, frame: str, meaning: str) -> None:
@@ -105,8 +104,7 @@ def format_nav2_parameters(*, quantity: str, unit: str, lowest: float, highest: 
     )
 
 
-_POSE_M = 0.25
-"""Largest distance of neighbouring poses of a path message [m]: controllers expect dense paths."""
+_POSE_M = 0.25  # largest distance of neighbouring poses of a path message [m]: controllers expect dense paths
 
 
 def make_path_message(xy_m: Floats) -> Json:

@@ -32,16 +32,13 @@ PROPERTY = "class"
 SUFFIXES = (".geojson", ".json")
 """A terrain file that ends so is polygons."""
 
-_MARGIN_DEG = 0.001
-"""Polygons are cut no nearer than this to a map."""
+_MARGIN_DEG = 0.001  # polygons are cut no nearer than this to a map
 
 _TERRAIN = Subject("layer", "terrain")
 
-_LOOKED_AT = 5_000_000
-"""Most vertices of pairs of polygons that are compared for overlaps."""
+_LOOKED_AT = 5_000_000  # most vertices of pairs of polygons that are compared for overlaps
 
-_TOGETHER = 32
-"""Polygons that are compared with all others at one time."""
+_TOGETHER = 32  # polygons that are compared with all others at one time
 
 _DETAILED = 10_000
 """Most vertices of a polygon before it is cut to the burnt part of the map: each pixel row visits every edge."""
@@ -64,7 +61,7 @@ class PolygonLayer:
     tally: Tally = field(default_factory=Tally)
 
     def shard(self, row0: int, col0: int, rows: int, cols: int) -> Pixels:
-        """Return class ids of a part of the map, shape (rows, cols); 0 where no polygon is."""
+        """Return class ids of a part of the map, shape (rows, cols); 0 if no polygon is."""
         side_m = self.grid.pixel_size_m
         left, top = self.grid.x_min_m + col0 * side_m, self.grid.y_max_m - row0 * side_m
         part = replace(self.grid, x_min_m=left, y_max_m=top, rows=rows, cols=cols)
@@ -144,9 +141,9 @@ def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[
     """Return a feature's class id; 0 and a line in ``problems`` without one. Numeric names are added to ``numbers``."""
     given = _find_class(feature)
     if given is None:
-        there = shorten_value(", ".join(sorted(feature.properties)) or "none")[1:-1]
+        properties = shorten_value(", ".join(sorted(feature.properties)) or "none")[1:-1]
         problems.append(
-            f"{feature.where}: has no property {PROPERTY!r} that names its terrain (its properties: {there})"
+            f"{feature.where}: has no property {PROPERTY!r} that names its terrain (its properties: {properties})"
         )
         return 0
     by_name = {name_key(entry.name): entry.id for entry in scheme.table.classes}

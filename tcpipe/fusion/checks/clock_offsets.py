@@ -117,9 +117,9 @@ def shift_sensors(m: Measurements, offsets: Mapping[str, ClockOffset], middle_ns
     A receiver's velocity has the same clock as its fixes.
     """
     offsets = {**offsets, **({DOPPLER: offsets[GNSS]} if GNSS in offsets else {})}
-    off = ((role, sensor) for role, sensor in m.sensors().items() if role in offsets)
+    corrected = ((role, sensor) for role, sensor in m.sensors().items() if role in offsets)
     return m.replace_sensors(
-        {role: replace(of, stamp_ns=shift_stamps(of.stamp_ns, offsets[role], middle_ns)) for role, of in off}
+        {role: replace(of, stamp_ns=shift_stamps(of.stamp_ns, offsets[role], middle_ns)) for role, of in corrected}
     )
 
 

@@ -308,7 +308,7 @@ def find_coarse_lag(late: Floats, against: Floats) -> float | None:
     best, lag_s = int(np.argmax(correlation)), _COARSE_S * _find_peak(correlation)
     # Noise reaches 4σ in 3,000 lags. Repeated lanes cause several peaks of similar height.
     is_noise = float(correlation[best]) * np.sqrt(late.shape[1] / _INDEPENDENT) < 6.0
-    apart = np.abs(np.arange(correlation.size) - best) * _COARSE_S > 3.0
+    is_other_peak = np.abs(np.arange(correlation.size) - best) * _COARSE_S > 3.0
     # On periodic drives another lag explains as much; threshold from simulated drives.
-    has_rival = abs(lag_s) > NEAR_S and float(correlation[apart].max()) > 0.7 * float(correlation[best])
+    has_rival = abs(lag_s) > NEAR_S and float(correlation[is_other_peak].max()) > 0.7 * float(correlation[best])
     return None if is_noise or np.isnan(lag_s) or has_rival else lag_s

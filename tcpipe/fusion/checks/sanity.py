@@ -81,7 +81,7 @@ class Command:
     yaw_rate_radps: Floats
 
 
-def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bool, felt: float) -> Exclusions:
+def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bool, force_mps2: float) -> Exclusions:
     """Return the sensors of a clock epoch to be excluded from fusion, with the reasons.
 
     Parameters
@@ -89,7 +89,7 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
     m : measurements in base_link axes, by the current extrinsics.
     is_imu_stated : whether the extrinsics of the IMU are stated (recipe, transforms, message in base_link) rather than
     assumed.
-    felt : median norm of the specific force as measured, not corrected for the lever arm; NaN without an
+    force_mps2 : median norm of the specific force as measured, not corrected for the lever arm; NaN without an
     IMU.
     """
     found: Exclusions = {}
@@ -120,7 +120,7 @@ def check_sensors(m: Measurements, command: Command | None, *, is_imu_stated: bo
     smooth = {role: average(rate, 2.0) for role, rate in rates.items() if role not in found}
     turns = _compare_signals(smooth, centred=True)
     turn_ratios = [abs(ratio) for pair, ratio in turns.items() if IMU in pair]
-    wrong = (_check_units(turn, turn_ratios, felt) or _check_mounting(level, yaws_rad)) if turn.size else None
+    wrong = (_check_units(turn, turn_ratios, force_mps2) or _check_mounting(level, yaws_rad)) if turn.size else None
     if wrong is not None:
         found[IMU], turn, yaws_rad = wrong, np.empty(0), {}
         turns = {pair: ratio for pair, ratio in turns.items() if IMU not in pair}
@@ -175,7 +175,7 @@ def _find_yaws(force: Plane, twists: Mapping[str, Floats]) -> dict[str, float]:
     return {role: float(np.angle(lag.factor)) for role, lag in lags.items() if lag and lag.explained > 0.1}
 
 
-def _check_units(turn: Floats, ratios: Sequence[float], felt: float) -> SensorExclusion | None:
+def _check_units(turn: Floats, ratios: Sequence[float], force_mps2: float) -> SensorExclusion | None:
     """Return the exclusion of an IMU in other units, by ratios of yaw rates (others to its own) and its force."""
     names, numbers = [], dict[str, float]()
     rate_radps = np.abs(turn[np.isfinite(turn)])
@@ -184,8 +184,8 @@ def _check_units(turn: Floats, ratios: Sequence[float], felt: float) -> SensorEx
     elif not ratios and np.count_nonzero(rate_radps > 15.0) > 0.005 * turn.size:  # no robot turns this fast
         names, numbers = ["deg"], {"rate_max": float(rate_radps.max())}
     low, high = GRAVITY_BAND_MPS2
-    if low <= felt * GRAVITY_MPS2 <= high:
-        names, numbers = [*names, "g"], numbers | {"force_median": felt}
+    if low <= force_mps2 * GRAVITY_MPS2 <= high:
+        names, numbers = [*names, "g"], numbers | {"force_median": force_mps2}
     units = "_".join(names)
     return SensorExclusion(IMU, "imu-units", {"units": units}, numbers, units) if names else None
 
@@ -194,8 +194,8 @@ def _check_mounting(level: Floats, yaws_rad: Mapping[str, float]) -> SensorExclu
     """Return the exclusion of an IMU that is tilted (by gravity) or rotated about the vertical (by accelerations)."""
     tilt_rad = float(np.arccos(np.clip(level[2, 2], -1.0, 1.0)))
     by_gravity = tilt_rad > np.radians(30.0)  # slopes average out; the steepest driven slope is 22.5°
-    is_aside = yaws_rad and all(abs(np.cos(each)) < 0.5 for each in yaws_rad.values())
-    if not by_gravity and not is_aside:
+    is_rotated = yaws_rad and all(abs(np.cos(each)) < 0.5 for each in yaws_rad.values())
+    if not by_gravity and not is_rotated:
         return None
     yaw_rad = next(iter(yaws_rad.values()), 0.0)
     turned_by = find_nearest_mounting(matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw_rad)) @ level)

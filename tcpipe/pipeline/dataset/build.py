@@ -330,5 +330,5 @@ def _name_remedy(place: Location) -> Iterator[None]:
     try:
         yield
     except DatasetError as error:
-        left = f"{place}: is not changed, because its inputs are unknown; move it or give another OUT"
-        raise DatasetError(*error.problems, left) from None
+        unchanged = f"{place}: is not changed, because its inputs are unknown; move it or give another OUT"
+        raise DatasetError(*error.problems, unchanged) from None

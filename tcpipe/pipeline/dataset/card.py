@@ -199,8 +199,10 @@ def fit_physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
     for robot in sorted(pc.unique(samples.column("robot")).to_pylist()):
         rows = np.flatnonzero(pc.equal(samples.column("robot"), robot).to_numpy())
         rows = rows[np.argsort(start_ns[rows], kind="stable")]
-        mine = samples.select(_FITTED).take(rows[:: -(-rows.size // _MOST_FITTED)])
-        fit = fit_and_validate_physics(make_fit_samples(mine), idle_watt=compute_mean_idle_power(mine))
+        robot_samples = samples.select(_FITTED).take(rows[:: -(-rows.size // _MOST_FITTED)])
+        fit = fit_and_validate_physics(
+            make_fit_samples(robot_samples), idle_watt=compute_mean_idle_power(robot_samples)
+        )
         if fit is not None:
             found[robot] = fit
     return found

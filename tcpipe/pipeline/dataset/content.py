@@ -78,7 +78,7 @@ class SampleTable:
     added: pa.Table
     """Columns beyond SAMPLES, in the segments' order."""
     convert: Callable[[pa.Table], pa.Table] | None = None
-    """Makes rows with coordinates those of a dataset without; None where the dataset has them."""
+    """Makes rows with coordinates those of a dataset without; None if the dataset has them."""
 
     @property
     def schema(self) -> pa.Schema:

@@ -89,14 +89,14 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> ChosenIn
     if problems:
         raise DatasetError(*problems)
     made_from = _describe_inputs(options, chosen.runs, records)
-    runs, again, of_drives = remove_duplicates(chosen.runs)
+    runs, duplicates, of_drives = remove_duplicates(chosen.runs)
     maps = partial(map, store.map_at, records)
     findings = (*chosen.findings, *of_drives)
     if not records and not options.without_patches:
         remedy = Remedy("add_map", command="tcpipe add-map NAME --height FILE")
         findings += (make_finding("no-map", Subject("dataset", options.recipe.dataset.name), remedies=[remedy]),)
     sources = tuple(_describe_run(run, RunSource) for run in runs)
-    return ChosenInputs(runs, sources, records, maps, made_from, again, chosen, findings)
+    return ChosenInputs(runs, sources, records, maps, made_from, duplicates, chosen, findings)
 
 
 def plan_inputs(store: Store, options: BuildOptions, state: State) -> DatasetInputs:
@@ -280,7 +280,7 @@ def remove_duplicates(runs: Sequence[StoredRun]) -> tuple[tuple[StoredRun, ...],
         ]
         return _SegmentPositions(to_integers(table, "start_ns"), to_integers(table, "end_ns"), np.column_stack(middle))
 
-    again: dict[str, Mask] = {}
+    duplicates: dict[str, Mask] = {}
     findings: list[Finding] = []
     by_sha256: dict[str, str] = {}
     for index, run in enumerate(runs):
@@ -303,9 +303,9 @@ def remove_duplicates(runs: Sequence[StoredRun]) -> tuple[tuple[StoredRun, ...],
             findings.append(_find_twice(run, int(twice.sum()), others))
         if twice.all() and len(twice):
             continue
-        again[run.run_id] = twice
+        duplicates[run.run_id] = twice
         kept[index] = run
-    return tuple(kept.values()), again, tuple(findings)
+    return tuple(kept.values()), duplicates, tuple(findings)
 
 
 def _find_twice(run: StoredRun, duplicates: int, others: Sequence[str]) -> Finding:
@@ -372,7 +372,7 @@ def _compute_equal_fraction(streams: Sequence[pa.Table]) -> float:
 
 
 def _find_span_ns(facts: RunFacts) -> tuple[int, int]:
-    """Return from when to when a run has segments: without any never, where it is not known at any time."""
+    """Return the time span of a run's segments: empty without segments, unlimited if it is unknown."""
     if not facts.segments:
         return _NEVER_NS, -_NEVER_NS
     if facts.start_ns is None or facts.end_ns is None:

@@ -73,7 +73,7 @@ class _Track:
     std_m: float
 
     def find_misfit(self) -> str:
-        """Return why the run's heights do not fit the map's ground; "" where they do."""
+        """Return the reason why the run's heights do not fit the map's ground; "" if they fit."""
         if self.found is None:
             return "too few points on the map"
         if self.found.scale.is_off():
@@ -181,8 +181,7 @@ def _make_map_registration(run_id: str, found: Registration, expected_m: float, 
 _CONTRADICTION = "map-contradicts-track"
 _LIMITS = ("min_slope_rad", "min_slope_rad", "min_rise_m", "min_bulge_m")
 _ATTITUDE_ROLES = {"imu", "visual_odometry", "pose"}
-_MIN_HEIGHT_CHANGE_M = 0.001
-"""A track whose heights change by less has no measured heights."""
+_MIN_HEIGHT_CHANGE_M = 0.001  # A track whose heights change by less has no measured heights
 _MOTION = ("start_z_m", "end_z_m", "chord_m", "pitch_rad", "roll_rad", "fused_velocity_mps")
 _Rows = Floats
 

@@ -85,7 +85,7 @@ def merge_recipe(recipe: Recipe | Location | None, *, holdout: str | None, seed:
 
 
 def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple[CovariateTable, ...]:
-    """Return the tables of the files; `DatasetError` where one cannot be used or two have one name."""
+    """Return the tables of the files; `DatasetError` if one cannot be used or two have one name."""
     if not paths:
         return ()
     from tcpipe.formats.covariates import read_covariates  # noqa: PLC0415  polars only where a table is given

@@ -39,7 +39,7 @@ class SelectedRuns:
     missing: Findings
     """On each matching run that was ingested in another way."""
     damaged: Findings
-    """On each run whose files were changed or lost."""
+    """Findings on runs whose files were changed or lost."""
     findings: Findings
     """On superseded runs."""
 
@@ -92,7 +92,7 @@ def choose_runs(
 def _find_left_out(
     rows: Iterable[RunFacts], code: str, names: Mapping[str, Mapping[str, str]], *, force: bool = False
 ) -> Iterator[Finding]:
-    """Yield a finding on each run of ``names``, with the command that ingests their logs again."""
+    """Yield a finding on each run of ``names``, with the command that ingests its log again."""
     command = f"tcpipe ingest {_suggest_logs(rows, names)}{' --force' if force else ''}" if names else ""
     for run_id in sorted(names):
         subject, remedy = Subject("run", run_id), Remedy("ingest", command=command)
@@ -114,8 +114,10 @@ def _select_tagged(store: Store, runs: list[StoredRun], tags: Mapping[str, str])
     chosen = [run for run in runs if tags.items() <= run.facts.tags.items()]
     if not chosen:
         wanted = " ".join(f"{key}={value}" for key, value in tags.items())
-        there = sorted({f"{key}={value}" for run in runs for key, value in run.facts.tags.items()})
-        raise DatasetError(f"{store.root}: no run is tagged {wanted}; tags there are: {', '.join(there) or 'none'}")
+        known_tags = sorted({f"{key}={value}" for run in runs for key, value in run.facts.tags.items()})
+        raise DatasetError(
+            f"{store.root}: no run is tagged {wanted}; tags there are: {', '.join(known_tags) or 'none'}"
+        )
     return chosen
 
 
@@ -160,9 +162,9 @@ def find_gone_runs(
 ) -> Findings:
     """Return a finding on each matching run of the replaced dataset that the store no longer has."""
     excluded = (*chosen.missing, *chosen.damaged, *chosen.findings)
-    here = {*(run.run_id for run in chosen.runs), *(finding.subject.name for finding in excluded)}
-    gone = [run.run_id for run in before if run.run_id not in here and _is_selected(run, robot, tags)]
-    return tuple(make_finding("run-gone", Subject("run", run_id)) for run_id in sorted(gone))
+    known = {*(run.run_id for run in chosen.runs), *(finding.subject.name for finding in excluded)}
+    missing = [run.run_id for run in before if run.run_id not in known and _is_selected(run, robot, tags)]
+    return tuple(make_finding("run-gone", Subject("run", run_id)) for run_id in sorted(missing))
 
 
 def find_other_sensors(sensors: Mapping[str, Mapping[str, Sensor]]) -> list[str]:
@@ -199,7 +201,7 @@ def _is_similar(one: Sensor, other: Sensor) -> bool:
 
 
 _LACKS = {"energy": "power", "slip": "wheel odometry", "vibration": "an IMU of 50 Hz or more"}
-"""By label: what a run without it lacks; a segment always has its time."""
+"""By label: the missing sensor of a run without it; a segment always has its time."""
 _ENDS_DEG = [f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")]
 
 
@@ -314,6 +316,6 @@ def move_losses(distance_by_reason_m: Mapping[str, float], lost_m: Mapping[Loss,
         name = flag_name(loss)
         moved[name] = moved.get(name, 0.0) + float(metres)
     total = math.fsum(float(metres) for metres in lost_m.values())
-    left = moved.get(KEPT, 0.0) - total
-    moved[KEPT] = left if left > 1e-9 * total else 0.0  # only rounding errors remain
+    rest_m = moved.get(KEPT, 0.0) - total
+    moved[KEPT] = rest_m if rest_m > 1e-9 * total else 0.0  # only rounding errors remain
     return moved

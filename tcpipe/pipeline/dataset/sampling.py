@@ -34,13 +34,11 @@ _BATCH_ROWS, _BATCH_BYTES = 8_192, 200_000_000
 _ROW_BITS = 32
 _ROW_MASK = (1 << _ROW_BITS) - 1
 
-_CELL_DEG = 1e-4
-"""Batches follow a space-filling curve over cells of this size, so that few batches decode a map tile."""
+_CELL_DEG = 1e-4  # batches follow a space-filling curve over cells of this size, so that few batches decode a map tile
 
 _PLACING = ("map_index", "position_std_m", "footprint_xy_m", "footprint_lonlat_deg")
 
-_HELD_MAPS = 2
-"""Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""
+_HELD_MAPS = 2  # maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB
 
 MapPlaces = Callable[[], Iterable[tuple[Path, FetchedShards | None]]]
 """Returns arguments of `open_map` on any machine, in order of priority; picklable."""
@@ -94,11 +92,9 @@ class Spool:
         return self.patch_px**2 * self.layers[layer].stored.itemsize
 
 
-_Batch = tuple[int, NDArray[np.uint64], pa.Table]
-"""Its number, and the ranks and rows of its segments."""
+_Batch = tuple[int, NDArray[np.uint64], pa.Table]  # its number, and the ranks and rows of its segments
 
-_held = dict[Path, tuple[MapFile, TilePool]]()
-"""Maps of this process, while it samples, the last used one last."""
+_held = dict[Path, tuple[MapFile, TilePool]]()  # maps of this process, while it samples, the last used one last
 
 
 def sample_all_segments(

@@ -22,10 +22,8 @@ from tcpipe.stages.sample import Sampled
 from tcpipe.tables.columns import to_integers
 from tcpipe.terrain.projection import Projection
 
-_ROWS = 1 << 16
-"""Rows whose ids are in memory together."""
-_MARGIN_DEG = 0.05
-"""Regions are cut this far around the samples (3 km or more below 60° latitude)."""
+_ROWS = 1 << 16  # rows whose ids are in memory together
+_MARGIN_DEG = 0.05  # regions are cut this far around the samples (3 km or more below 60° latitude)
 
 
 def draw_splits(

@@ -25,8 +25,7 @@ from tcpipe.tables.findings import Finding, Findings, Subject, read_catalogue
 from tcpipe.tables.levels import COORDINATES
 
 _ENDS = ("start", "end")
-_DIGITS = 4
-"""Digits of metres and radians: finer ones would show how places differ from chords, and so the latitude."""
+_DIGITS = 4  # digits of metres and radians: finer ones would show how places differ from chords, and so the latitude
 
 _DOCS = {
     "run_id": "number of the run",
@@ -48,8 +47,7 @@ _KEPT_FIELDS = (
 _KEPT_SECTIONS = ("fuse", "mask", "segment", "label", "sample", "split", "dataset")
 """Sections of the recipe that name no topics, files or robots."""
 
-_KEPT_SUBJECTS = ("role", "class", "layer", "slope", "split")
-"""Kinds of subjects whose names the dataset has anyway."""
+_KEPT_SUBJECTS = ("role", "class", "layer", "slope", "split")  # kinds of subjects whose names the dataset has anyway
 
 
 @dataclass(frozen=True, slots=True)

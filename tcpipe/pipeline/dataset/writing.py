@@ -65,9 +65,9 @@ def write_dataset(directory: Path, inputs: ChosenInputs, options: BuildOptions, 
 
 def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
     """Write the samples; return the columns that card and page are made from, mapped from another file."""
-    asked = dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS))
+    requested = dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *REPEATABILITY_COLUMNS, *SAMPLE_COLUMNS))
     schema = samples.schema
-    names = [name for name in asked if name in schema.names]
+    names = [name for name in requested if name in schema.names]
 
     def write_both() -> Iterator[pa.Table]:
         for piece in samples.pieces():

@@ -72,7 +72,7 @@ def scan_anew(place):
 
 def describe(state):
     """Return all that a state says, but not how many documents were read for it."""
-    return replace(state, read=0, beaten=sorted(state.beaten), damaged=sorted(state.damaged))
+    return replace(state, read=0, replaced=sorted(state.replaced), damaged=sorted(state.damaged))
 
 
 # --- names ----------------------------------------------------------------------------------------------------------
@@ -113,7 +113,7 @@ def test_the_highest_number_counts_and_a_writer_takes_one_more(place):
     found = scan_anew(place)
     assert found.find_tags("a log") == {"soil": "wet"}
     assert found.highest["tags", KEY] == 2
-    assert len(found.beaten) == 2
+    assert len(found.replaced) == 2
     put(place, found, tags(soil="snow"))
     assert scan_anew(place).find_tags("a log") == found.find_tags("a log") == {"soil": "snow"}
 

@@ -136,7 +136,7 @@ def test_replaced_documents_and_their_payload_go(store):
     found = prune(store=store.root, recipe=OLD)
     assert ("payload that no document names", str(store.root / BLOBS / first)) in describe(found.removed)
     assert not (store.root / BLOBS / first).exists()
-    assert len(store.scan().beaten) == 1, "the number 1 of this call"
+    assert len(store.scan().replaced) == 1, "the number 1 of this call"
     (run,) = store.find_runs("c")
     assert run.segments().num_rows == 15
     assert run.facts.tags == {"weather": "dry"}

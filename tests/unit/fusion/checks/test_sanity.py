@@ -54,7 +54,7 @@ def checked(gnss=None, *, wheels=None, visual=None, imu=None, command=None, stat
         visual=None if visual is None else odometry(visual, axes=3),
     )
     wanted = None if command is None else order(AT_NS, command[:, 0])
-    return check_sensors(m, wanted, is_imu_stated=stated, felt=9.81)
+    return check_sensors(m, wanted, is_imu_stated=stated, force_mps2=9.81)
 
 
 def excluded(*args, **sensors):
@@ -118,7 +118,7 @@ def test_a_sensor_that_repeats_one_value_is_frozen(sensor):
             m.wheels, velocity_mps=m.wheels.velocity_mps[:1] * np.ones((T.size, 1)), yaw_rate_radps=one[:, 1]
         )
         m = replace(m, wheels=replace(frozen, velocity_mps=0.1 * frozen.velocity_mps))
-    found = check_sensors(m, None, is_imu_stated=False, felt=9.81)
+    found = check_sensors(m, None, is_imu_stated=False, force_mps2=9.81)
     assert {role: of.code for role, of in found.items()} == {sensor: "frozen"}
 
 
