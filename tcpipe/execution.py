@@ -151,47 +151,47 @@ def _run_alone(function: Callable[[T], R], task: T, index: int) -> Outcome[R]:
 def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """Yield worker processes that send their log lines here and end with this block."""
     context = _WorkerContext()
-    heard, saying = context.Pipe(duplex=False)
-    life, alive = context.Pipe(duplex=False)
-    listener = threading.Thread(target=_repeat, args=(heard,), daemon=True)
+    log_in, log_out = context.Pipe(duplex=False)
+    child, parent = context.Pipe(duplex=False)
+    listener = threading.Thread(target=_repeat, args=(log_in,), daemon=True)
     listener.start()
     pool = ProcessPoolExecutor(
-        workers, mp_context=context, initializer=_begin_worker, initargs=(life, saying, logger.getEffectiveLevel())
+        workers, mp_context=context, initializer=_begin_worker, initargs=(child, log_out, logger.getEffectiveLevel())
     )
     try:
         yield pool
     except BaseException:
-        alive.close()
+        parent.close()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-        for end in (saying, alive, life):
+        for end in (log_out, parent, child):
             end.close()
         listener.join()
-        heard.close()
+        log_in.close()
     if any(worker.exitcode == _UNGUARDED_EXIT for worker in context.workers):
         raise UsageError(_UNGUARDED)
 
 
-def _repeat(heard: Connection) -> None:
+def _repeat(log_in: Connection) -> None:
     """Log the messages of workers here, until the last worker ends."""
     with suppress(EOFError):
         while True:
-            logger.log(*heard.recv())
+            logger.log(*log_in.recv())
 
 
-def _begin_worker(life: Connection, saying: Connection, level: int) -> None:
+def _begin_worker(child: Connection, log_out: Connection, level: int) -> None:
     """Prepare a worker: it ignores interrupts, ends with its parent, and sends its log messages to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    logger.addHandler(_LogForwarder(saying.send))
+    logger.addHandler(_LogForwarder(log_out.send))
     logger.setLevel(level)
     logger.propagate = False
-    threading.Thread(target=_end_with, args=(life,), daemon=True).start()
+    threading.Thread(target=_end_with, args=(child,), daemon=True).start()
 
 
-def _end_with(life: Connection) -> None:
+def _end_with(child: Connection) -> None:
     with suppress(EOFError, OSError):
-        life.recv_bytes()
+        child.recv_bytes()
     os._exit(1)
 
 

@@ -67,7 +67,7 @@ def evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     "--kinds", multiple=True, type=click.Choice(["linear", "physics", "boosting", "resnet18"]),
     help="Kind of model; repeatable (default: all).",
 )  # fmt: skip
-@click.option("--seeds", default=5, type=click.IntRange(1, 100), help="Trainings of each network.")
+@click.option("--seeds", default=5, type=click.IntRange(1, 100), help="Number of trainings of each network.")
 @click.option("--out", default="benchmark", type=OUTPUT_DIRECTORY, help="Directory of tables, models and evaluations.")
 @click.option("--predictor", metavar="FILE.py[:NAME]", help="Your own model, compared with the other kinds.")
 @add_output("benchmark", as_values=True)

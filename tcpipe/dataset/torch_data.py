@@ -26,7 +26,7 @@ class TorchBatches(IterableDataset[Any]):
         self._passes += 1
         if worker is None:
             return map(_to_tensors, self._batches.epoch(number))
-        loader_seed = worker.seed - worker.id  # of this epoch, equal in all workers; a loader's generator rules it
+        loader_seed = worker.seed - worker.id  # of this epoch, equal in all workers; set by a loader's generator
         return map(_to_tensors, self._batches.part(worker.id, worker.num_workers).epoch(loader_seed + number))
 
 

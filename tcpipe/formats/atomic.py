@@ -311,7 +311,7 @@ def _remove_if_abandoned(holder: Path, act: Callable[[], object]) -> bool:
 
 
 def _take_place(temporary: Path, place: Path) -> None:
-    """Rename ``temporary`` to ``place``; if something is there they change places, in one step where the system can."""
+    """Rename ``temporary`` to ``place``; an existing directory there is exchanged, if possible in one step."""
     if not place.exists():
         try:
             temporary.rename(place)

@@ -110,12 +110,12 @@ def _estimate_yaw(
         if imu is None
         else imu.quat_xyzw[np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns)]
     )
-    own, source = (float(rpy_from_quat(oriented[0])[2]), "orientation") if len(oriented) else (0.0, "")
+    own_yaw, source = (float(rpy_from_quat(oriented[0])[2]), "orientation") if len(oriented) else (0.0, "")
     if gnss is None:
-        return own, 0.01, source or "local frame"
+        return own_yaw, 0.01, source or "local frame"
     if track is not None:
-        shown_s = STEP_S * float(np.argmax(np.abs(track.speed_mps) > MIN_SPEED_MPS))
-        std = float(np.hypot(np.hypot(track.heading_std_rad, 0.03), bias_std * shown_s))
+        moving_s = STEP_S * float(np.argmax(np.abs(track.speed_mps) > MIN_SPEED_MPS))
+        std = float(np.hypot(np.hypot(track.heading_std_rad, 0.03), bias_std * moving_s))
         return float(track.heading_rad[0]), min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
     posed = np.flatnonzero(np.isfinite(gnss.quat_xyzw).all(1))[:1] if gnss.quat_xyzw is not None else np.empty(0, int)
     if gnss.quat_xyzw is not None and posed.size:  # first attitude of a pose, less the turn until then
@@ -123,7 +123,7 @@ def _estimate_yaw(
         if motion is not None:
             turned = float(np.interp(at_s, motion.attitude.time_s, motion.attitude.yaw_rad)[0])
         return float(rpy_from_quat(gnss.quat_xyzw[posed[0]])[2]) - turned, 0.1, "pose"  # rad: its frame and mounting
-    return own, _UNKNOWN_YAW_STD_RAD, source or "unknown"
+    return own_yaw, _UNKNOWN_YAW_STD_RAD, source or "unknown"
 
 
 def _estimate_position(

@@ -308,8 +308,8 @@ def prepare_imu(
     """
     rate = _stack_columns(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     force = _stack_columns(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
-    of_orientation, is_alive = np.zeros(3, np.bool_), np.nan_to_num(np.diff(force, axis=0)).any()
-    if is_alive and (np.nan_to_num(rate) == 0.0).all(0).any():
+    of_orientation, is_changing = np.zeros(3, np.bool_), np.nan_to_num(np.diff(force, axis=0)).any()
+    if is_changing and (np.nan_to_num(rate) == 0.0).all(0).any():
         quat = normalize(_stack_columns(columns, _QUAT))
         rate, of_orientation = compute_orientation_rates(stamp_ns, rate, quat)
     # No gyroscope measures 100 rad/s, no accelerometer 1,000 m/s²; NaN compares false.

@@ -406,7 +406,7 @@ def _compute_offsets(times: TopicTimes, known: Mask, epoch: Ints) -> dict[int, i
 
 
 def _find_header_problem(times: TopicTimes, own_steps: Sequence[tuple[int, int]]) -> str | None:
-    """Return why a topic's log time rules, or None if its header does."""
+    """Return the reason why a topic's log time is used, or None if its header is."""
     known = _is_set(times)
     if times.prefer == "log":
         return RECIPE

@@ -218,10 +218,10 @@ def _ends_before(one: Topic, other: Topic) -> bool:
     return one.end_ns is not None and other.start_ns is not None and one.end_ns < other.start_ns
 
 
-def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:
-    """Return the silence of a topic [ns], by the spans (first, last time) of the parts of a log with its messages.
+def compute_dropouts_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:
+    """Return the total duration of a topic's dropouts [ns], from the spans (first, last time) with its messages.
 
-    Only gaps above 5 s and ten mean periods count.
+    Only gaps of more than 5 s and ten mean periods count.
     """
     if len(spans_ns) < 2 or not count:
         return 0

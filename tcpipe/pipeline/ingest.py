@@ -94,7 +94,7 @@ class SummaryLine:
     """The last line of ``ingest --json``: the results of all logs."""
 
     recipe: str
-    """The file that rules, or that it is the defaults."""
+    """The file of the recipe, or that it is the defaults."""
     store: str | None
     """None if no store was made."""
     exit_code: int

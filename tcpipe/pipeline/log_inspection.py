@@ -67,7 +67,7 @@ class InspectedTopic:
     wrong_stamps: int | None = omit()
     """Stamps beside zero that were replaced."""
     time: Literal["header", "log"] | None = omit()
-    """Which stamps rule."""
+    """Which stamps are used."""
     time_why: str | None = omit()
     header_minus_log_s: float | None = None
     moved_s: tuple[float, ...] | None = omit()

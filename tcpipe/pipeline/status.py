@@ -71,7 +71,7 @@ class Status:
     history: tuple[Call, ...]
     """The latest calls, the last one first."""
     runs: int
-    """Under the ruling recipe."""
+    """Under the current recipe."""
     findings: Mapping[str, int]
     """Number of runs with each warning and error, by code, the worst first."""
     exit_code: int

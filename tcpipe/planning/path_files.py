@@ -62,7 +62,7 @@ class PathResult(PathTotals):
         """Return the totals, their intervals, and findings, as plain lines."""
         above = ", net" if self.label_energy == "net" else ""
         above += f", adapted by {self.adapted_by}" if self.adapted_by else ""
-        findings = format_findings(find_doubts(self, Subject("file", self.path.name)))
+        findings = format_findings(find_path_findings(self, Subject("file", self.path.name)))
         table = [] if self.out is None else [f"{self.out}: {self.path_segments} path segments"]
         return clean_lines((f"{self.path}: {format_cost(self)}{above}", *findings, *table))
 
@@ -94,8 +94,8 @@ def _format_quantity(value: float, interval: tuple[float, float] | None, unit: s
     return f"{value:.{digits}f} {unit} ({COVERAGE:.0%}: {low:.{digits}f} to {high:.{digits}f})"
 
 
-def find_doubts(totals: PathTotals, path: Subject) -> Iterator[Finding]:
-    """Yield where the model has no support on a path, and how little its intervals rest on."""
+def find_path_findings(totals: PathTotals, path: Subject) -> Iterator[Finding]:
+    """Yield findings on path segments that the model does not support, and on the basis of its intervals."""
     for reason, count in totals.reasons.items():
         names, total = {"reason": reason.replace("_", " ")}, totals.path_segments
         # turns have costs of their own
@@ -194,7 +194,7 @@ class PlanResult(PlanTotals):
     def _find_doubts(self) -> Iterator[Finding]:
         """Yield findings on path segments that the cells do not show."""
         path = Subject("file", self.out.name)
-        yield from find_doubts(self, path)
+        yield from find_path_findings(self, path)
         if not self.complete:
             yield make_finding("cells-too-large", path)
         if self.negative_steps:

@@ -219,7 +219,7 @@ class _Search:
             ellipse = self._ellipse(bound_m)
             if count := int(np.count_nonzero(ellipse & ~survey.predicted)):
                 logger.info(
-                    "predicting %d cells, %d courses each; a cost map (tcpipe cost-map) saves that", count, COURSES
+                    "predicting %d cells, %d courses each; a cost map (tcpipe cost-map) avoids this", count, COURSES
                 )
                 survey.predict(ellipse)
             self._check_open()

@@ -146,7 +146,7 @@ def read_power(
             rejected[0] = replace(rejected[0], remedies=_propose_sources(scaled))
         return PowerReadings(findings=tuple(rejected))
     given: CurrentSign = "auto" if any(source.joints for source in sources) else current_sign
-    sign, sign_findings, sign_source = _sign(rails, log_times, sources, given)
+    sign, sign_findings, sign_source = _find_drawn_sign(rails, log_times, sources, given)
     if sign == 0:
         return PowerReadings(findings=sign_findings)
     includes = tuple(dict.fromkeys(source.other_loads for source in sources if source.other_loads))
@@ -491,7 +491,7 @@ def _correlate_voltage(rails: Rails, log_times: Mapping[str, Floats]) -> float:
     return 0.0 if sag is None or not sag.amp.any() else abs(float(np.corrcoef(sag.volt, sag.amp)[0, 1]))
 
 
-def _sign(
+def _find_drawn_sign(
     rails: Rails, log_times: Mapping[str, Floats], sources: list[PowerSource], given: CurrentSign
 ) -> tuple[int, Findings, str]:
     """Return the sign of a drawn current (0 if the record contradicts its type), findings, and the sign's source."""
@@ -511,7 +511,7 @@ def _sign(
 
 
 def _sign_by_charge(sign: int, net: float, sources: Sequence[PowerSource]) -> tuple[int, Findings, str]:
-    """Return the result of `_sign` if types define no sign: if charge flows both ways, ROS's convention or no power."""
+    """Return the result of `_find_drawn_sign` from the mean current, else by the convention of ROS, else no power."""
     if sign < 0:
         return -1, (), "drawn_negative (mean, as ROS has it)"
     if sign > 0:

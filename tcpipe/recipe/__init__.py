@@ -448,7 +448,7 @@ class Recipe:
 
     @property
     def ingest(self) -> IngestSections:
-        """The sections that rule a run's files."""
+        """The sections that determine a run's files."""
         return IngestSections(
             self.read, self.fuse, self.mask, self.segment, self.label, self.robots, self.power_sources, self.tables
         )

@@ -110,7 +110,7 @@ def draw_classes(source: MapFile) -> Bytes:
 
 
 def draw_maps(sources: Sequence[MapFile], look: Callable[[MapFile], Bytes] = draw_ortho) -> Bytes:
-    """Return one picture of all maps over their joint bounds, each by ``look``; the first rules where they overlap."""
+    """Return one picture of all maps over their joint bounds, each by ``look``; the first counts in overlaps."""
     if len(sources) == 1:
         return look(sources[0])
     crs = sources[0].grid.crs

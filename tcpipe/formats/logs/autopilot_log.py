@@ -395,7 +395,7 @@ def _find_message(data: bytes, start: int, lengths: list[int]) -> int:
 def _define_format(
     data: bytes, at: int, lengths: list[int], formats: dict[int, tuple[str, Layout, dict[str, float]]]
 ) -> None:
-    """Read a format; the first of a number counts; of a contradictory one only the length of its messages is used."""
+    """Read a format. The first one with a number is used; a contradictory one only gives the length of its messages."""
     kind, length, name, letters, labels = struct.unpack_from("<BB4s16s64s", data, at)
     codes = [_DATAFLASH_TYPES.get(letter) for letter in letters.rstrip(b"\0").decode("latin-1")]
     given = [*labels.rstrip(b"\0").decode("ascii", "replace").split(","), *[""] * len(codes)]

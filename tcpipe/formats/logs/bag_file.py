@@ -22,7 +22,7 @@ from tcpipe.formats.logs.log_part import (
     gather_integers,
     outline_of,
 )
-from tcpipe.logs.topics import Topic, compute_silence_ns, normalize_type_name
+from tcpipe.logs.topics import Topic, compute_dropouts_ns, normalize_type_name
 
 MAGIC = b"#ROSBAG V2.0\n"
 
@@ -547,6 +547,6 @@ def _make_topic(connection: _Connection) -> Topic:
         max(connection.ends, default=None),
         "ros1",
         connection.definition,
-        silent_ns=compute_silence_ns(list(zip(connection.starts, connection.ends, strict=True)), connection.count),
+        silent_ns=compute_dropouts_ns(list(zip(connection.starts, connection.ends, strict=True)), connection.count),
         schema_encoding="ros1msg",
     )

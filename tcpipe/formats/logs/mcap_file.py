@@ -48,7 +48,7 @@ from tcpipe.formats.logs.mcap_records import (
     read_summary,
     record_offsets,
 )
-from tcpipe.logs.topics import Topic, compute_silence_ns, normalize_type_name
+from tcpipe.logs.topics import Topic, compute_dropouts_ns, normalize_type_name
 
 _LOOSE_BYTES = 1 << 22  # messages outside chunks are read in runs of about this size
 
@@ -394,7 +394,7 @@ class McapPart(ChunkedPart[Chunk]):
             end_ns,
             channel.encoding,
             schema.definition,
-            silent_ns=compute_silence_ns([(chunk.start_ns, chunk.end_ns) for chunk in self._holding(number)], count),
+            silent_ns=compute_dropouts_ns([(chunk.start_ns, chunk.end_ns) for chunk in self._holding(number)], count),
             schema_encoding=schema.encoding,
         )
 

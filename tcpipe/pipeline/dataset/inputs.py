@@ -151,7 +151,7 @@ def _refuse_without_segments(runs: Sequence[StoredRun]) -> None:
 
 
 def prove_maps(store: Store, maps: Sequence[StoredMap]) -> None:
-    """Compare the maps' files with their documents; `MapError` for a changed or lost file, which reads as no data."""
+    """Compare the maps' files with their documents; `MapError` for a changed or lost file (else read as no data)."""
     root = store.place.path
     if root is None:  # files in a bucket are verified when they are fetched
         return
@@ -380,32 +380,32 @@ def _find_span_ns(facts: RunFacts) -> tuple[int, int]:
     return facts.start_ns, facts.end_ns
 
 
-def _find_shared(mine: _SegmentPositions, other: _SegmentPositions) -> Mask:
-    """Mark the segments of ``mine`` that are ``other``'s: at one time a robot is at one place."""
+def _find_shared(own: _SegmentPositions, other: _SegmentPositions) -> Mask:
+    """Mark the segments of ``own`` that are ``other``'s: at one time a robot is at one place."""
     skew_ns = 0
-    together_ns = min(mine.end_ns[-1], other.end_ns[-1]) - max(mine.start_ns[0], other.start_ns[0])
-    if together_ns >= _SAME_DRIVE * min(way.end_ns[-1] - way.start_ns[0] for way in (mine, other)):
-        loosely, apart_ns = _find_overlapping(mine, other, slack_ns=_SAME_TIME_NS)
-        if loosely.sum() >= _SAME_DRIVE * min(len(mine.start_ns), len(other.start_ns)):
+    together_ns = min(own.end_ns[-1], other.end_ns[-1]) - max(own.start_ns[0], other.start_ns[0])
+    if together_ns >= _SAME_DRIVE * min(way.end_ns[-1] - way.start_ns[0] for way in (own, other)):
+        loosely, apart_ns = _find_overlapping(own, other, slack_ns=_SAME_TIME_NS)
+        if loosely.sum() >= _SAME_DRIVE * min(len(own.start_ns), len(other.start_ns)):
             skew_ns = int(np.median(apart_ns[loosely]))
-    return _find_overlapping(mine, other, skew_ns=skew_ns)[0]
+    return _find_overlapping(own, other, skew_ns=skew_ns)[0]
 
 
 def _find_overlapping(
-    mine: _SegmentPositions, other: _SegmentPositions, *, slack_ns: int = 0, skew_ns: int = 0
+    own: _SegmentPositions, other: _SegmentPositions, *, slack_ns: int = 0, skew_ns: int = 0
 ) -> tuple[Mask, Ints]:
-    """Mark segments whose middle half overlaps one of the other's in time, with slack, at most 2 m from it.
+    """Mark segments whose middle half overlaps a segment of ``other`` in time (with slack) and is within 2 m of it.
 
-    The second array is their delay after that one [ns], minus ``skew_ns``.
+    The second array is their delay after that segment [ns], minus ``skew_ns``.
     """
-    start_ns, quarter_ns = mine.start_ns - skew_ns, (mine.end_ns - mine.start_ns) // 4
+    start_ns, quarter_ns = own.start_ns - skew_ns, (own.end_ns - own.start_ns) // 4
     first = np.searchsorted(other.end_ns, start_ns + quarter_ns - slack_ns, side="right")
     last = np.searchsorted(other.start_ns, start_ns + 3 * quarter_ns + slack_ns, side="left") - 1
     nearest_m, apart_ns = np.full(len(start_ns), np.inf), np.zeros(len(start_ns), np.int64)
     for at in (first, (first + last) // 2, last):
         there = np.clip(at, 0, len(other.start_ns) - 1)
-        step_deg = other.lonlat_deg[there] - mine.lonlat_deg
-        east_m = step_deg[:, 0] * _METRES_PER_DEG * np.cos(np.radians(mine.lonlat_deg[:, 1]))
+        step_deg = other.lonlat_deg[there] - own.lonlat_deg
+        east_m = step_deg[:, 0] * _METRES_PER_DEG * np.cos(np.radians(own.lonlat_deg[:, 1]))
         away_m = np.hypot(east_m, step_deg[:, 1] * _METRES_PER_DEG)
         nearer = (first <= last) & (away_m < nearest_m)
         nearest_m[nearer], apart_ns[nearer] = away_m[nearer], (start_ns - other.start_ns[there])[nearer]

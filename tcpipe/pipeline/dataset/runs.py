@@ -115,9 +115,7 @@ def _select_tagged(store: Store, runs: list[StoredRun], tags: Mapping[str, str])
     if not chosen:
         wanted = " ".join(f"{key}={value}" for key, value in tags.items())
         known_tags = sorted({f"{key}={value}" for run in runs for key, value in run.facts.tags.items()})
-        raise DatasetError(
-            f"{store.root}: no run is tagged {wanted}; tags there are: {', '.join(known_tags) or 'none'}"
-        )
+        raise DatasetError(f"{store.root}: no run is tagged {wanted}; known tags: {', '.join(known_tags) or 'none'}")
     return chosen
 
 

@@ -10,7 +10,7 @@ from tcpipe.logs import roles
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import (
     Topic,
-    compute_silence_ns,
+    compute_dropouts_ns,
     find_robot,
     find_robot_namespaces,
     find_short_topics,
@@ -499,7 +499,7 @@ S = 1_000_000_000
     ],
 )
 def test_silences_are_summed_where_they_are_no_period(spans_s, count, silent_s):
-    assert compute_silence_ns([(first * S, last * S) for first, last in spans_s], count) == silent_s * S
+    assert compute_dropouts_ns([(first * S, last * S) for first, last in spans_s], count) == silent_s * S
 
 
 def test_a_topic_that_paused_for_most_of_the_drive_covers_little():
