@@ -103,7 +103,7 @@ def test_the_property_split_rules(tmp_path):
         (polygon([[533000, 5212000], [533100, 5212000], [533100, 5212100], [533000, 5212000]]), "they look projected"),
         (polygon([[-33.9, 151.2], [-33.9, 151.3], [-33.8, 151.3], [-33.9, 151.2]]), "axes look swapped"),
         (collection(feature(polygon(SQUARE), split="validation")), "split is 'validation', expected one of train_test"),
-        (collection(feature(polygon(SQUARE), split="unseen")), "nothing could train"),
+        (collection(feature(polygon(SQUARE), split="unseen")), "no region is left for training"),
         ({"crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}, **polygon(SQUARE)}, "export it again"),
         (polygon([[15, float("nan")], *SQUARE[1:-1], [15, float("nan")]]), "NaN is not a number"),
         (polygon([[1e308, 1e308], *SQUARE[1:4], [1e308, 1e308]]), "no lon/lat degrees"),

@@ -210,5 +210,7 @@ def test_a_cache_that_cannot_be_is_named_with_what_names_another(tmp_path: Path)
     place = open_place("s3://tests")
     place.put("a", b"content")
     (tmp_path / "cache").touch()
-    with pytest.raises(StoreError, match=r"cache/../.*: cannot be written \(.*\); TCPIPE_CACHE names another place"):
+    with pytest.raises(
+        StoreError, match=r"cache/../.*: cannot be written \(.*\); set TCPIPE_CACHE to use another directory"
+    ):
         place.fetch("a", Checksum(7, hashlib.sha256(b"content").hexdigest()))

@@ -260,7 +260,7 @@ def test_no_field_of_a_finding_passes_unless_the_catalogue_calls_it_public(kind)
 
 def test_what_needs_coordinates_or_names_says_so(built):
     here, *_ = built
-    with pytest.raises(DatasetError, match="public: is without coordinates, so that its samples have no known source"):
+    with pytest.raises(DatasetError, match="public: has no coordinates, so the source of its samples is unknown"):
         explain("north-1", dataset=here / "public", store=here / "store")
 
 
