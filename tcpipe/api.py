@@ -99,13 +99,10 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     it is what the command prints. Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` if an
     input cannot be used.
     """
-    from tcpipe.learning.models import choose_model
-    from tcpipe.planning.path_files import choose_map
+    from tcpipe.planning.path_files import load_inputs
     from tcpipe.planning.path_files import predict_path as run
 
-    source = choose_map(options.store, options.map)
-    asked = choose_model(options.model, speed_mps=options.speed, predictor=options.predictor)
-    known = None
+    (asked, source), known = load_inputs(options), None
     if options.adapt is not None:
         from tcpipe.planning.drives import collect_runs
         from tcpipe.store import open_store
@@ -124,11 +121,9 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` if an input cannot be used, or there is
     no path.
     """
-    from tcpipe.learning.models import choose_model
-    from tcpipe.planning.path_files import choose_map, plan
+    from tcpipe.planning.path_files import load_inputs, plan
 
-    asked = choose_model(options.model, speed_mps=options.speed, predictor=options.predictor)
-    return plan(asked, choose_map(options.store, options.map), options)
+    return plan(*load_inputs(options), options)
 
 
 plan_path = as_function(PlanPathOptions, run_plan_path)

@@ -7,7 +7,7 @@ The command line prints them; a traceback is a bug.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 _URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]+:/{1,2})(\S+)", re.IGNORECASE)
@@ -53,6 +53,12 @@ def list_first(names: Sequence[str], most: int = 1) -> str:
     """Return the first names, and the number of the others."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"{', '.join(names[:most])}{more}"
+
+
+def align_columns(rows: Sequence[Sequence[str]], align: Callable[[str, int], str] = str.ljust) -> list[str]:
+    """Return the rows of a table, its header first, as lines with columns of one width."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(align, row, widths)).rstrip() for row in rows]
 
 
 def clean_lines(lines: Iterable[str]) -> str:
@@ -113,15 +119,7 @@ class StoreError(TcpipeError):
 
 
 class MissingFileError(StoreError):
-    """A file of the store is missing; ``where`` is its path or URL."""
-
-    def __init__(self, where: str, findings: Iterable[Any] = ()) -> None:
-        super().__init__(f"{where}: is missing", findings=findings)
-        self.where = where
-
-    def __reduce__(self) -> tuple[type[TcpipeError], tuple[str, ...], dict[str, tuple[Any, ...]]]:
-        """Pickle with the path instead of the complete line."""
-        return type(self), (self.where,), {"findings": self.findings}
+    """A file of the store is missing."""
 
 
 class DatasetError(TcpipeError):

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcpipe.errors import StoreError, UsageError
+from tcpipe.errors import MapError, StoreError, UsageError
 from tcpipe.formats.atomic import Location, check_input, check_local_output, make_unique_name
 from tcpipe.formats.documents import BLOBS, KINDS, Kind, Record, State, make_key, make_run_key, put_document, scan
 from tcpipe.formats.documents import parse_name as parse_document_name
@@ -95,13 +95,6 @@ class Store:
         root, fetched = fetch_files(place, record.files, by_range=lambda name: not name.endswith(described))
         return root / f"{record.name}.zarr", fetched
 
-    def find_map(self, name: str, state: State | None = None) -> StoredMap:
-        """Return a map; `StoreError` without one of this name."""
-        found = (self.scan() if state is None else state).maps.get(check_map_name(name))
-        if found is None:
-            raise StoreError(f"{self.root}: no map {name!r} in the store")
-        return found
-
     @contextmanager
     def new_map(self, name: str) -> Iterator[tuple[Path, Callable[[State], None]]]:
         """Yield the path for a new map (its picture ``.png`` beside it), and a function that stores both."""
@@ -145,6 +138,22 @@ def name_run(state: State, stem: str, sha256: str) -> str:
     taken = {row.run_id for row in state.runs.values()}
     names = (f"{stem}-{sha256[:length]}" for length in range(_NAME_HEX, len(sha256), 4))
     return next((name for name in names if name not in taken), f"{stem}-{sha256}")
+
+
+def choose_maps(store: Store, state: State, names: Sequence[str], *, hint: str = "") -> tuple[StoredMap, ...]:
+    """Return the named maps of a store in their order, or its only one; ``hint`` follows the advice to name one.
+
+    `MapError`: there is no such map; `UsageError`: there are several, and none is named.
+    """
+    maps, wanted = state.maps, [f" {name!r}" for name in names if name not in state.maps]
+    if not maps:
+        advice = "add one: tcpipe add-map NAME --height FILE"
+        raise MapError(f"{store.root}: no map{''.join(wanted[:1])} in the store; {advice}")
+    if wanted:
+        raise MapError(f"{store.root}: no map{wanted[0]} in the store; there are {', '.join(maps)}")
+    if not names and len(maps) > 1:
+        raise UsageError(f"{store.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map{hint}")
+    return tuple(maps[name] for name in dict.fromkeys(names)) or tuple(maps.values())
 
 
 def check_map_name(name: str) -> str:
@@ -216,7 +225,11 @@ def find_named_runs(name: Location, store: Location) -> list[StoredRun]:
 
 def find_named_run(name: Location, store: Location) -> StoredRun:
     """Return the run called RUN or RUN/RECIPE; `UsageError` if the store has none, or several of that name."""
-    found = find_named_runs(name, store)
+    return take_one_run(name, find_named_runs(name, store))
+
+
+def take_one_run(name: Location, found: Sequence[StoredRun]) -> StoredRun:
+    """Return the only run of those called ``name``; `UsageError` for runs under several recipes."""
     if len(found) > 1:
         names = ", ".join(run.name for run in found)
         raise UsageError(f"{name}: was ingested under several recipes; expected one of {names}")

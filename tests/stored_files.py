@@ -23,7 +23,7 @@ def tables(store: Path, name: str = "segments") -> list[Path]:
 def map_path(store: Path, name: str) -> Path:
     """The Zarr group of a map."""
     opened = Store(store)
-    return Path(opened.place.where(opened.find_map(name).zarr))
+    return Path(opened.place.where(opened.scan().maps[name].zarr))
 
 
 def checksums(store: Path) -> dict[str, object]:

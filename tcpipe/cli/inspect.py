@@ -9,6 +9,7 @@ import click
 
 from tcpipe.cli.options import add_path_or_run, json_option, msgdef_option, recipe_option, robot_option
 from tcpipe.cli.output import NEXT_STEP, print_json, print_line, print_lines
+from tcpipe.errors import align_columns
 
 if TYPE_CHECKING:
     from tcpipe.formats.dataset_card import InspectedDataset
@@ -231,9 +232,8 @@ def _format_answer(value: object) -> str:
 
 
 def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
-    for row in (header, *rows):
-        print_line("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    for line in align_columns([header, *rows]):
+        print_line(line)
 
 
 _NEXT_STEPS = {

@@ -175,7 +175,7 @@ def _print_findings(summary: IngestSummary) -> None:
     from tcpipe.formats.finding_lines import format_groups, group_findings
 
     made = [result.run for result in summary.results if result.run and result.status != "unchanged"]
-    groups = [(group, len(made), "runs") for group in group_findings((run.run_id, run.findings) for run in made)]
+    groups = group_findings(((run.run_id, run.findings) for run in made), len(made))
     for line in format_groups(groups, more=f"tcpipe report {summary.store}"):
         print_line(line)
 

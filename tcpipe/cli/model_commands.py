@@ -16,10 +16,8 @@ if TYPE_CHECKING:
 
     from tcpipe.experiment.benchmark import BenchmarkResult
     from tcpipe.experiment.reproduction import Reproduction, Size
-    from tcpipe.formats.maps.map_files import MapFile
     from tcpipe.learning.evaluation_files import EvaluationResult
     from tcpipe.learning.fitting import ModelKind
-    from tcpipe.learning.models import Model
     from tcpipe.learning.training import TrainResult
     from tcpipe.planning.cost_map import CostMapResult
     from tcpipe.planning.drives import DrivesResult
@@ -139,18 +137,10 @@ def cost_map(options: CostMapOptions) -> CostMapResult:
     its own.
     """
     from tcpipe.planning.cost_map import make_cost_map
+    from tcpipe.planning.path_files import load_inputs
 
-    inputs = _load_inputs(options)
+    inputs = load_inputs(options)
     return make_cost_map(*inputs, options.out, cell_size_m=options.cell_size, origin_deg=options.origin)
-
-
-def _load_inputs(options: CostMapOptions | RouteGraphOptions) -> tuple[Model, MapFile]:
-    """Return the model and the map, wherever this is called."""
-    from tcpipe.learning.models import choose_model
-    from tcpipe.planning.path_files import choose_map
-
-    source = choose_map(options.store, options.map)
-    return choose_model(options.model, speed_mps=options.speed, predictor=options.predictor), source
 
 
 @click.command("plan-path")
@@ -176,8 +166,9 @@ def route_graph(options: RouteGraphOptions) -> RouteGraphResult:
 
     Exit code 3: some edges have no cost; they are left out.
     """
+    from tcpipe.planning.path_files import load_inputs
     from tcpipe.planning.route_graph import write_route_graph
 
     out, graph = Path(options.out), Path(options.graph)
-    inputs = _load_inputs(options)
+    inputs = load_inputs(options)
     return write_route_graph(*inputs, out, graph=graph, origin_deg=options.origin, two_way=options.two_way)

@@ -17,7 +17,7 @@ from scipy.special import stdtrit
 from tcpipe import __version__
 from tcpipe.arrays import Floats, Texts
 from tcpipe.dataset import open_dataset
-from tcpipe.errors import UsageError, clean_lines
+from tcpipe.errors import UsageError, align_columns, clean_lines
 from tcpipe.formats.atomic import Location, write_text
 from tcpipe.formats.json_files import read_json, write_json
 from tcpipe.formats.parquet import read_table
@@ -86,9 +86,7 @@ class BenchmarkResult:
         """Return the tables as plain lines."""
         lines = list[str]()
         for title, header, rows in list_tables(self.values.rows):
-            cells = [header, *rows]
-            widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-            lines += [title, *("  ".join(map(str.ljust, row, widths)).rstrip() for row in cells), ""]
+            lines += [title, *align_columns([header, *rows]), ""]
         return clean_lines((*lines, f"open {self.path / PAGE}"))
 
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from tcpipe.errors import DatasetError, UsageError, clean_lines
+from tcpipe.errors import DatasetError, clean_lines
 from tcpipe.experiment.benchmark import BenchmarkRow, list_tables, run_benchmark
 from tcpipe.experiment.claims import FEWEST_SEEDS, Claim, check_claims
 from tcpipe.experiment.networks import compare_networks
-from tcpipe.formats.atomic import Location, clear, write_text
+from tcpipe.formats.atomic import Location, check_new, clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.evaluation import UNKNOWN_DISTANCE, EvaluateConfig, Evaluation
 from tcpipe.learning.fitting import FitConfig
@@ -119,8 +119,7 @@ def reproduce(
     """
     place, plan = Path(directory), SIZES[size]
     clear(place)
-    if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
-        raise UsageError(f"{place}: exists and is no reproduction; give another DIR")
+    check_new(place, "reproduction", "site")
     made, seconds = find_scenario(plan.scenario), Counter[str]()
     with _measure_time(seconds, "simulate"):
         site = simulate(place / "site", scenario=made, seed=SIMULATION_SEED)

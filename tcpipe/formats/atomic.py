@@ -383,6 +383,19 @@ def check_output(path: Location, wanted: str = "directory") -> Path:
     return place
 
 
+def check_file_name(path: Path, *endings: str) -> None:
+    """Raise `UsageError` unless a path is that of a file with one of these endings, there or not."""
+    if path.suffix.lower() not in endings or path.is_dir():
+        raise UsageError(f"{path}: expected the name of a file that ends in {' or '.join(endings)}")
+
+
+def check_new(path: Path, kind: str, *marks: str) -> None:
+    """Raise `UsageError` unless a directory is new, empty, or one of a ``kind``, by one of the files ``marks`` in it."""
+    is_ours = path.is_dir() and (not any(path.iterdir()) or any((path / mark).exists() for mark in marks))
+    if path.exists() and not is_ours:
+        raise UsageError(f"{path}: exists and is no {kind}; it is not changed; give another directory")
+
+
 def check_input(path: Location, wanted: str = "file or directory") -> Path:
     """Return the path of an existing file or directory; `UsageError` if it is missing or of another kind."""
     kind = _find_kind(Path(path))

@@ -379,13 +379,13 @@ def judge_dataset(findings: Iterable[Finding], runs: Iterable[RunSource], maps: 
 
 def group_dataset_findings(
     findings: Sequence[Finding], by_run: Mapping[str, Sequence[Finding]], by_map: Mapping[str, Sequence[Finding]] = {}
-) -> list[tuple[FindingGroup[str], int | None, str]]:
+) -> list[FindingGroup]:
     """Return all findings of a dataset grouped by code, with the number of runs or maps and the word for them."""
     own = [(finding.subject.name, [finding]) for finding in findings if finding.subject.kind != "run"]
     of_runs = [(finding.subject.name, [finding]) for finding in findings if finding.subject.kind == "run"]
     runs = len({*by_run, *(name for name, _ in of_runs)})
     return [
-        *((group, None, "") for group in group_findings(own)),
-        *((group, runs, "runs") for group in group_findings([*of_runs, *by_run.items()])),
-        *((group, len(by_map), "maps") for group in group_findings(by_map.items())),
+        *group_findings(own),
+        *group_findings([*of_runs, *by_run.items()], runs),
+        *group_findings(by_map.items(), len(by_map), "maps"),
     ]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from string import Formatter
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -29,8 +28,6 @@ from tcpipe.tables.findings import (
     rank_severity,
     sort_findings,
 )
-
-K = TypeVar("K", bound=Hashable)
 
 _UNITS: Mapping[str, tuple[str, float]] = {
     "_jpm": (" J/m", 1.0), "_spm": (" s/m", 1.0),
@@ -153,8 +150,8 @@ def list_findings(findings: Iterable[Finding]) -> list[str]:
     return list_groups(_make_single_groups(findings))
 
 
-def _make_single_groups(findings: Iterable[Finding]) -> list[tuple[FindingGroup[str], int | None, str]]:
-    return [(FindingGroup(each.code, {each.subject.name: (each,)}), None, "") for each in sort_findings(findings)]
+def _make_single_groups(findings: Iterable[Finding]) -> list[FindingGroup]:
+    return [FindingGroup(each.code, {each.subject.name: (each,)}) for each in sort_findings(findings)]
 
 
 def format_verdict(verdict: Verdict) -> str:
@@ -220,12 +217,15 @@ def advise_on_loss(reason: str) -> str:
 
 
 @dataclass(frozen=True)
-class FindingGroup(Generic[K]):
+class FindingGroup:
     """Findings of one code in several runs, logs or maps."""
 
     code: str
-    of: Mapping[K, Findings]
+    of: Mapping[str, Findings]
     """By run, log or map."""
+    total: int | None = None
+    """Number of runs or maps, also of those without such a finding; None where it is not printed."""
+    noun: str = "runs"
 
     @cached_property
     def findings(self) -> list[Finding]:
@@ -238,38 +238,41 @@ class FindingGroup(Generic[K]):
         return min((finding.severity for findings in self.of.values() for finding in findings), key=rank_severity)
 
 
-def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[FindingGroup[K]]:
-    """Return the findings grouped by code: the worst first, then those of most runs."""
-    found: dict[str, dict[K, Findings]] = {}
+def group_findings(
+    findings: Iterable[tuple[str, Iterable[Finding]]], total: int | None = None, noun: str = "runs"
+) -> list[FindingGroup]:
+    """Return the findings of ``total`` runs or maps grouped by code: the worst first, then those of most runs."""
+    found: dict[str, dict[str, Findings]] = {}
     for key, each in findings:
         for finding in each:
             findings_by_subject = found.setdefault(finding.code, {})
             findings_by_subject[key] = (*findings_by_subject.get(key, ()), finding)
 
-    def rank(group: FindingGroup[K]) -> tuple[int, int, int]:
+    def rank(group: FindingGroup) -> tuple[int, int, int]:
         return rank_severity(group.severity), -len(find_entry(group.code).affects), -len(group.of)
 
-    return sorted((FindingGroup(code, grouped) for code, grouped in found.items()), key=rank)
+    return sorted((FindingGroup(code, grouped, total, noun) for code, grouped in found.items()), key=rank)
 
 
-def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") -> str:
-    """Return a group as one line, with its number of runs out of ``total`` if given; of one finding its evidence."""
+def format_group(group: FindingGroup) -> str:
+    """Return a group as one line, with its number of runs out of the total if known; of one finding its evidence."""
     findings = group.findings
     if len(group.of) == 1 and len(findings) == 1:
         key, line = next(iter(group.of)), format_finding(findings[0])
         return line if key == findings[0].subject.name else f"{key}: {line}"
     shared = findings[0].remedies if all(finding.remedies == findings[0].remedies for finding in findings) else ()
     remedies = ". ".join(describe_remedy(findings[0], remedy) for remedy in shared)
-    return format_count(group.code, len(group.of), total, what, _describe_range(findings), remedy=remedies)
+    details = _describe_range(findings)
+    return format_count(group.code, len(group.of), group.total, group.noun, details, remedy=remedies)
 
 
-def describe_group(group: FindingGroup[K], total: int | None, what: str) -> str:
+def describe_group(group: FindingGroup) -> str:
     """Return the summary of a group of findings: number, subjects and range, without title, remedy and code."""
     findings, key = group.findings, next(iter(group.of))
     if len(group.of) == 1 and len(findings) == 1:
         line = describe_finding(findings[0])
         return line if key == findings[0].subject.name else f"{key}: {line}"
-    head = "" if total is None else f"{len(group.of)} of {total} {what}: "
+    head = "" if group.total is None else f"{len(group.of)} of {group.total} {group.noun}: "
     return f"{head}{_describe_range(findings)}"
 
 
@@ -299,31 +302,29 @@ def _format_range(findings: Sequence[Finding]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def format_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]], *, more: str = "") -> list[str]:
-    """Return at most `MOST_LINES` groups as lines, each with the arguments of `format_group`, the worst first.
+def format_groups(groups: Iterable[FindingGroup], *, more: str = "") -> list[str]:
+    """Return at most `MOST_LINES` groups as lines, the worst first.
 
     The last line states how many others and notes are listed by the command ``more``.
     """
     printed = _sort_printed(groups)
-    problems = [group for group in printed if group[0].severity != "note"]
+    problems = [group for group in printed if group.severity != "note"]
     counted = ((max(len(problems) - MOST_LINES, 0), "more finding"), (len(printed) - len(problems), "note"))
     rest = " and ".join(f"{count} {what}{'' if count == 1 else 's'}" for count, what in counted if count)
     return list_groups(problems[:MOST_LINES]) + ([f"and {rest}{f': {more}' if more else ''}"] if rest else [])
 
 
-def _sort_printed(
-    groups: Iterable[tuple[FindingGroup[K], int | None, str]],
-) -> list[tuple[FindingGroup[K], int | None, str]]:
+def _sort_printed(groups: Iterable[FindingGroup]) -> list[FindingGroup]:
     """Return the groups, the worst first, except those on witnesses, which are lines of the verdict."""
-    printed = (group for group in groups if group[0].code != WITNESSES_OF_LABEL)
-    return sorted(printed, key=lambda group: rank_severity(group[0].severity))
+    printed = (group for group in groups if group.code != WITNESSES_OF_LABEL)
+    return sorted(printed, key=lambda group: rank_severity(group.severity))
 
 
-def list_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
+def list_groups(groups: Iterable[FindingGroup]) -> list[str]:
     """Return every group as a line, the worst first, notes too, with the recipe that fits in no line below it."""
     lines = []
-    for group, total, what in _sort_printed(groups):
-        lines += [f"{group.severity}: {format_group(group, total, what)}"]
+    for group in _sort_printed(groups):
+        lines += [f"{group.severity}: {format_group(group)}"]
         lines += [f"    {line}" for line in format_remedy_blocks(group.findings)]
     return lines
 

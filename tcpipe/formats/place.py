@@ -230,7 +230,7 @@ class Place:
                 return on_disk(self._at(name))
             return ask_store(self.where(name), lambda store: in_bucket(store, self._key(name)), what=what)
         except (FileNotFoundError, NotADirectoryError):
-            raise MissingFileError(self.where(name)) from None
+            raise MissingFileError(f"{self.where(name)}: is missing") from None
         except OSError as error:
             raise StoreError(f"{self.where(name)}: cannot be {what} ({error.strerror or error})") from error
 

@@ -191,12 +191,6 @@ def _add_code(model: Model, predictor: str | None) -> Model:
     return replace(model, own=own, checksum=digest([model.checksum, own.digest]))
 
 
-def choose_model(path: Location, *, speed_mps: float | None = None, predictor: str | None = None) -> Model:
-    """Return a model as `load_model`, asked for a commanded speed [m/s] if one is given."""
-    model = load_model(path, predictor)
-    return model if speed_mps is None else set_speed(model, speed_mps)
-
-
 def set_speed(model: Model, speed_mps: float) -> Model:
     """Return the model for a commanded speed [m/s] instead of the usual one; `UsageError` for an untrained speed."""
     command = next((feature for feature in model.card.inputs.extra_features if feature.name == "command_mps"), None)

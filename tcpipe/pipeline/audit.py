@@ -11,7 +11,7 @@ import pyarrow as pa
 from scipy.special import betaincinv
 
 from tcpipe.arrays import Floats, Ints, Mask
-from tcpipe.errors import FusionError, UsageError, clean_lines
+from tcpipe.errors import FusionError, UsageError, align_columns, clean_lines
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
@@ -290,11 +290,7 @@ class Audit:
         lines = [f"{self.run}: robot {self.robot}"]
         if self.scores:
             lines += ["m: median and 95 % of the errors of withheld fixes, their median σ; shares inside 1σ and 2σ", ""]
-            rows = [_HEADER, *map(_make_row, self.scores)]
-            widths = [max(len(row[k]) for row in rows) for k in range(len(_HEADER))]
-            lines += [
-                "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-            ]
+            lines += align_columns([_HEADER, *map(_make_row, self.scores)], str.rjust)
         lines += [f"track / {role}: {ratio:.4f} of its distance" for role, ratio in self.length_ratios.items()]
         lines += [f"not audited: {line}" for line in self.skipped]
         return clean_lines(lines)

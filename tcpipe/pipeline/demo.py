@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from tcpipe.errors import DatasetError, UsageError
-from tcpipe.formats.atomic import clear
+from tcpipe.errors import DatasetError
+from tcpipe.formats.atomic import check_new, clear
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import read_intact_card
 from tcpipe.pipeline.dataset.build import build_dataset
@@ -60,10 +60,7 @@ def run_demo(directory: Path, *, seed: int, begin_part: Callable[..., None]) -> 
     """
     site_path, store_path, dataset_path = directory / "site", directory / "store", directory / "dataset"
     clear(directory)
-    if directory.exists() and not directory.is_dir():
-        raise UsageError(f"{directory}: is a file, expected a directory for the demo")
-    if directory.exists() and any(directory.iterdir()) and not site_path.exists():
-        raise UsageError(f"{directory}: exists and is no demo; give another directory")
+    check_new(directory, "demo", "site")
     begin = partial(begin_part, total=_PARTS)
     begin(0, text="simulating a site and two drives")
     site = simulate(site_path, scenario="demo", seed=seed)

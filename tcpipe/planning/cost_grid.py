@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.arrays import Bytes, Floats, Floats32, GenericArray, Ints, Mask, NamedArrays
 from tcpipe.errors import MapError
@@ -144,10 +145,14 @@ class CostGrid:
         for name in ("power_watt", "velocity_mps", "reasons"):
             array = getattr(self, name)
             array.reshape(COURSES, -1)[:, cells] = getattr(found, name).reshape(-1, COURSES).T
-        height = found.height_m.reshape(-1, COURSES)
-        known = np.isfinite(height)
-        count, total = known.sum(axis=1), np.where(known, height, 0.0).sum(axis=1)
-        self.height_m.reshape(-1)[cells] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+        self.height_m.reshape(-1)[cells] = average_known(found.height_m.reshape(-1, COURSES), 1)
+
+
+def average_known(values: NDArray[np.floating], axis: int) -> Floats:
+    """Return the mean over the courses, which are an axis of ``values``, that have a value; NaN where none has."""
+    known = ~np.isnan(values)
+    count, total = known.sum(axis=axis), np.where(known, values, 0.0).sum(axis=axis, dtype=float)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def make_empty_grid(grid: MapGrid) -> CostGrid:

@@ -26,8 +26,15 @@ from numpy.typing import NDArray
 
 from tcpipe.arrays import Bytes, Floats, Floats32
 from tcpipe.cost.prediction_errors import QuantityErrors
-from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
-from tcpipe.formats.atomic import Location, clear_beside, lock_directory, make_scratch_directory, write_text
+from tcpipe.errors import MapError, StoreError, clean_lines
+from tcpipe.formats.atomic import (
+    Location,
+    check_new,
+    clear_beside,
+    lock_directory,
+    make_scratch_directory,
+    write_text,
+)
 from tcpipe.formats.integrity import FileChecksums, compute_checksums, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
@@ -44,6 +51,7 @@ from tcpipe.planning.cost_grid import (
     COURSES,
     CellFrames,
     CostGrid,
+    average_known,
     iterate_blocks,
     iterate_row_strips,
     make_empty_grid,
@@ -178,7 +186,8 @@ def make_cost_map(
     key, out = make_cost_map_key(model, source, cell_size_m), str(out).rstrip("/")
     grid, frame = make_grid(source, cell_size_m), make_frame(source, origin_deg)
     if not is_url(out):
-        _check_directory(Path(out))
+        clear_beside(Path(out))
+        check_new(Path(out), "cost map", CARD)
     with _claim_spool(out) as spool:
         found = _read_known(out, key)  # after the lock: another process may have been first
         if found is not None and found.origin_deg == origin_deg:
@@ -195,13 +204,6 @@ def make_cost_map(
             )  # fmt: skip
             write_sealed(directory / CARD, card)
     return CostMapResult(out, "done", card)
-
-
-def _check_directory(out: Path) -> None:
-    """Raise `UsageError` for something else than a cost map."""
-    clear_beside(out)
-    if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out}: exists and is no cost map; give another directory")
 
 
 def _read_known(out: str, key: str) -> CostMapCard | None:
@@ -333,16 +335,11 @@ class _Strips:
         some = is_known.any(axis=0)
         nothing = np.full(trusted.shape, np.nan)
         std = nothing if self.errors is None else self.errors[name].compute_std(trusted, self.class_id[first:last])
-        more = [*(np.where(some, band, np.nan) for band in (least, _mean(trusted), best)), _mean(std)]
+        more = [
+            *(np.where(some, band, np.nan) for band in (least, average_known(trusted, 0), best)),
+            average_known(std, 0),
+        ]
         return np.concatenate([values, np.stack(more)]).astype(np.float32)
-
-
-def _mean(values: NDArray[np.floating]) -> Floats:
-    """Return the mean over the courses that have a value; NaN where none has."""
-    known = ~np.isnan(values)
-    count = known.sum(axis=0)
-    total = np.where(known, values, 0.0).sum(axis=0, dtype=float)
-    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
 def _compute_mean(strips: _Strips, name: str) -> Floats:

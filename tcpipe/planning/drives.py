@@ -30,7 +30,7 @@ from tcpipe.planning.path_cost import find_added_turning
 from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles
 from tcpipe.stages.sample import Shifts
-from tcpipe.store import Store, open_store
+from tcpipe.store import Store, open_store, take_one_run
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import PREDICTED, Finding, Findings, Subject, Verdict, judge, make_finding, read_threshold
@@ -101,10 +101,7 @@ def find_drive(store: Store, log: str) -> StoredRun:
             f"{log}: {store.root} has no run of this log or name; "
             "expected the path of an ingested log, a run or RUN/RECIPE"
         )
-    if len(found) > 1:
-        names = ", ".join(run.name for run in found)
-        raise UsageError(f"{log}: was ingested under several recipes; expected one of {names}")
-    return found[0]
+    return take_one_run(log, found)
 
 
 Reasons = Sequence[Sequence[str]]

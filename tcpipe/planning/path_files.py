@@ -10,8 +10,8 @@ import numpy as np
 from tcpipe.arrays import Floats
 from tcpipe.cost.adaptation import MeasuredRun
 from tcpipe.cost.prediction_errors import COVERAGE
-from tcpipe.errors import MapError, ModelError, StoreError, UsageError, clean_lines
-from tcpipe.formats.atomic import Location, clear_beside
+from tcpipe.errors import ModelError, StoreError, UsageError, clean_lines
+from tcpipe.formats.atomic import Location, check_file_name, clear_beside
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature, read_line
 from tcpipe.formats.integrity import describe_broken
@@ -19,15 +19,15 @@ from tcpipe.formats.json_files import convert_record, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.maps.nav2 import make_gps_waypoints, make_path_message
 from tcpipe.formats.published_outputs import fetch_directory
-from tcpipe.learning.models import Model
+from tcpipe.learning.models import Model, load_model, set_speed
 from tcpipe.planning.cost_grid import CostGrid, make_survey
 from tcpipe.planning.cost_map import CARD, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import Reason, check_model
 from tcpipe.planning.frames import Frame, make_frame
 from tcpipe.planning.path_cost import PathTotals, compute_path_cost, write_path_segments
-from tcpipe.planning.path_options import PlanPathOptions
+from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions, RouteGraphOptions
 from tcpipe.planning.plan import PlanTotals, plan_path
-from tcpipe.store import open_store
+from tcpipe.store import choose_maps, open_store
 from tcpipe.tables.bits import flag_name
 from tcpipe.tables.findings import Finding, Severity, Subject, make_finding
 
@@ -35,15 +35,16 @@ from tcpipe.tables.findings import Finding, Severity, Subject, make_finding
 def choose_map(store: Location, name: str | None) -> MapFile:
     """Return the named map of a store, or its only one; `UsageError` if there are several and none is named."""
     opened = open_store(store)
-    state = opened.scan()
-    maps = state.maps
-    if not maps:
-        raise MapError(f"{opened.root}: no map in the store; add one: tcpipe add-map NAME --height FILE")
-    if name is None and len(maps) > 1:
-        raise UsageError(f"{opened.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map")
-    if name is not None and name not in maps:
-        raise MapError(f"{opened.root}: no map {name!r} in the store; there are {', '.join(maps)}")
-    return open_map(*opened.map_at(opened.find_map(name or next(iter(maps)), state)))
+    (record,) = choose_maps(opened, opened.scan(), [] if name is None else [name])
+    return open_map(*opened.map_at(record))
+
+
+def load_inputs(
+    options: PredictPathOptions | PlanPathOptions | CostMapOptions | RouteGraphOptions,
+) -> tuple[Model, MapFile]:
+    """Return the model, asked for the commanded speed if one is given, and the map of a call."""
+    source, model = choose_map(options.store, options.map), load_model(options.model, options.predictor)
+    return model if options.speed is None else set_speed(model, options.speed), source
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,8 +125,7 @@ def predict_path(
     ``adapted_by`` is the run whose labels adapt the model.
     """
     if out is not None:
-        if out.suffix.lower() not in {".csv", ".geojson"} or out.is_dir():
-            raise UsageError(f"{out}: expected the name of a file that ends in .csv or .geojson")
+        check_file_name(out, ".csv", ".geojson")
         clear_beside(out)
         if out.resolve() == path.resolve():
             raise UsageError(f"{out}: is the file of the path; give the table another name")
@@ -228,8 +228,7 @@ def plan(model: Model, source: MapFile, options: PlanPathOptions) -> PlanResult:
 
 def _check_output(out: Path) -> None:
     """Raise `UsageError` if the output is not named as GeoJSON, or is an existing file that is not a plan."""
-    if out.suffix.lower() not in {".geojson", ".json"} or out.is_dir():
-        raise UsageError(f"{out}: expected the name of a file that ends in .geojson or .json")
+    check_file_name(out, ".geojson", ".json")
     clear_beside(out)
     if out.exists():
         try:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tcpipe.errors import PathError, UsageError, clean_lines
+from tcpipe.formats.atomic import check_file_name
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.json_files import Json, write_json
 from tcpipe.formats.maps.map_files import MapFile
@@ -85,8 +86,7 @@ def write_route_graph(
     Raises `PathError`, `ModelError` or `MapError` if the graph, the model or the map cannot be used; `UsageError` or
     `StoreError` if ``out`` is the graph, has a wrong name or cannot be written.
     """
-    if out.suffix.lower() not in {".geojson", ".json"} or out.is_dir():
-        raise UsageError(f"{out}: expected the name of a file that ends in .geojson or .json")
+    check_file_name(out, ".geojson", ".json")
     if out.resolve() == graph.resolve():
         raise UsageError(f"{out}: is the graph itself; give the output another name")
     check_model(model, source)

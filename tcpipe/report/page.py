@@ -119,7 +119,7 @@ class VerdictBox:
 def show_verdict(
     verdict: Verdict,
     findings: Iterable[Finding] = (),
-    groups: Iterable[tuple[FindingGroup[Any], int | None, str]] = (),
+    groups: Iterable[FindingGroup] = (),
     *,
     labels: Sequence[Affected] = AFFECTED,
 ) -> VerdictBox:
@@ -131,8 +131,8 @@ def show_verdict(
     for (severity, code), of_code in by_code.items():
         observed = [(describe_finding(finding), finding.span_s) for finding in of_code]
         entries.append(ShownFinding(severity, code, find_entry(code).title, observed, list_remedies(of_code)))
-    for group, total, noun in groups:
-        title, text = find_entry(group.code).title, describe_group(group, total, noun)
+    for group in groups:
+        title, text = find_entry(group.code).title, describe_group(group)
         entries.append(ShownFinding(group.severity, group.code, title, [(text, None)], list_remedies(group.findings)))
     problems = [line for severity in ("error", "warning") for line in entries if line.severity == severity]
     return VerdictBox(

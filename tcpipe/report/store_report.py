@@ -76,7 +76,7 @@ class RunRow:
     values: Mapping[str, Json]
 
 
-def sort_runs(content: StoreFacts, groups: Sequence[FindingGroup[str]], terms: Sequence[str]) -> list[RunRow]:
+def sort_runs(content: StoreFacts, groups: Sequence[FindingGroup], terms: Sequence[str]) -> list[RunRow]:
     """Return a row for each run and recipe, the latest first; then those without a segment.
 
     ``groups``: findings of the current runs by code; ``terms``: of the physics of all runs.
@@ -144,7 +144,7 @@ def store_report(content: StoreFacts, tracks: Plot | None = None) -> str:
     """Return the HTML page of a store; with ``tracks`` of few runs on the map, these and the table come first."""
     all_runs = list_runs(content.state)
     current = [facts for facts in all_runs if counts(facts, content.state) and facts.ingest_key == content.ruling]
-    groups = group_findings((facts.run_id, facts.findings) for facts in current)
+    groups = group_findings(((facts.run_id, facts.findings) for facts in current), len(current))
     terms = sorted({term for facts in all_runs for term in facts.physics if not term.startswith("idle")})
     runs = sort_runs(content, groups, terms)
     changes = tuple(compare_batteries((facts.run_id, facts.robot, facts.findings) for facts in current))
@@ -158,7 +158,7 @@ def store_report(content: StoreFacts, tracks: Plot | None = None) -> str:
     return render_page(
         title=f"Store {content.store.root}",
         lead="All runs. Sums, trends and losses use the runs of the current recipe and exclude superseded runs.",
-        verdict=show_verdict(verdict, changes, [(each, len(current), "runs") for each in groups]) if current else None,
+        verdict=show_verdict(verdict, changes, groups) if current else None,
         numbers=_make_numbers(content, [run.facts for run in runs if run.is_current]),
         warnings=[] if current else [problem],
         sections=[

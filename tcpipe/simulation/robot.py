@@ -196,15 +196,15 @@ def _evaluate_at_contact(world: World, robot: SimulatedRobot, x: Floats, y: Floa
     classes = world.terrain_class(x, y)
     usual = robot.ground_table()[:, 2][classes] * world.resistance_factor(x, y)
     if robot.wheels is None or world.surface is None:
-        return np.asarray(usual)
+        return usual
     half = robot.wheels.contact_m / 2.0
     u, v = world.site.uv_m(x, y)
     higher, lower = (world.surface.relief_m(classes, u + at * cos, v + at * sin) for at in (half, -half))
-    return np.asarray(usual + 0.5 * robot.wheels.bump_loss * np.abs(higher - lower) / robot.wheels.contact_m)
+    return usual + 0.5 * robot.wheels.bump_loss * np.abs(higher - lower) / robot.wheels.contact_m
 
 
 def _compute_side_drag(world: World, wheels: Wheels, x: Floats, y: Floats, heading: Heading) -> Floats:
     """Return the drag of running sidelong: of a side force sin(slope across) at the slip angle that gives it."""
     rise_x, rise_y = world.gradient(x, y)
     across = rise_y * heading[0] - rise_x * heading[1]
-    return np.asarray(across**2 / (1.0 + across**2) / wheels.cornering_per_rad)
+    return across**2 / (1.0 + across**2) / wheels.cornering_per_rad

@@ -9,8 +9,8 @@ import numpy as np
 
 from tcpipe import __version__
 from tcpipe.arrays import Floats
-from tcpipe.errors import UsageError, clean_lines
-from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
+from tcpipe.errors import clean_lines
+from tcpipe.formats.atomic import check_new, clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.json_files import to_json, write_json
 from tcpipe.formats.logs.writing import MessageStream, write_bag, write_mcap, write_rosbag2
 from tcpipe.formats.maps.geotiff import write_geotiff
@@ -64,8 +64,7 @@ def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> 
     files = (*site.logs, *site.rasters.values(), site.region, *site.truths, site.world)
     if all(path.exists() for path in files) and site.world.read_bytes() == to_json(about).encode():
         return replace(site, unchanged=True)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out}: exists and is not this simulated site; give another directory")
+    check_new(out, f"site of scenario {chosen.name}, seed {seed}")
     with write_atomic_directory(out) as directory:
         half = _read_site(directory, chosen)
         for index, spec in enumerate(chosen.drives):

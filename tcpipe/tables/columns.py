@@ -41,7 +41,7 @@ def to_texts(column: pa.Array | pa.ChunkedArray) -> Texts:
     """Return a column of texts, shape (N,)."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     encoded = array.dictionary_encode(null_encoding="encode")
-    return np.asarray(np.array(encoded.dictionary.to_pylist(), np.str_)[to_numbers(encoded.indices)])
+    return np.array(encoded.dictionary.to_pylist(), np.str_)[to_numbers(encoded.indices)]
 
 
 def number_column(values: AnyArray, *, nan_is_null: bool = False) -> pa.Array:

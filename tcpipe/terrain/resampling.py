@@ -28,13 +28,14 @@ def _position(lattice: Floats, row: float, col: float) -> tuple[float, float]:
     i, j = row / LATTICE_STEP_PX + 1.0, col / LATTICE_STEP_PX + 1.0
     a, b = min(int(i), lattice.shape[0] - 2), min(int(j), lattice.shape[1] - 2)
     v, u = i - a, j - b
-    x = (1 - v) * ((1 - u) * lattice[a, b, 0] + u * lattice[a, b + 1, 0]) + v * (
-        (1 - u) * lattice[a + 1, b, 0] + u * lattice[a + 1, b + 1, 0]
-    )
-    y = (1 - v) * ((1 - u) * lattice[a, b, 1] + u * lattice[a, b + 1, 1]) + v * (
-        (1 - u) * lattice[a + 1, b, 1] + u * lattice[a + 1, b + 1, 1]
-    )
-    return x, y
+    return _blend(lattice, a, b, 0, u, v), _blend(lattice, a, b, 1, u, v)
+
+
+@compile_kernel
+def _blend(lattice: Floats, a: int, b: int, axis: int, u: float, v: float) -> float:  # noqa: PLR0917
+    """Return a coordinate between rows a and a + 1 and columns b and b + 1 of a lattice, at shares v and u of these."""
+    upper = (1 - u) * lattice[a, b, axis] + u * lattice[a, b + 1, axis]
+    return float((1 - v) * upper + v * ((1 - u) * lattice[a + 1, b, axis] + u * lattice[a + 1, b + 1, axis]))
 
 
 @compile_kernel

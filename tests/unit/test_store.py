@@ -10,11 +10,11 @@ from storage_server import READ_ONLY
 from stored_files import table
 from synthetic_store import add_run, change_run, lanes, segments, supersede, tag_run
 
-from tcpipe.errors import StoreError, UsageError
+from tcpipe.errors import MapError, StoreError, UsageError
 from tcpipe.formats.documents import scan
 from tcpipe.formats.place import Place
 from tcpipe.recipe import ReadConfig, Recipe
-from tcpipe.store import Store, check_map_name, is_store, name_run, open_store
+from tcpipe.store import Store, check_map_name, choose_maps, is_store, name_run, open_store
 
 RUN = "north"
 
@@ -212,12 +212,12 @@ def read_tile(store, record):
 def test_a_map_that_a_reader_has_found_stays_where_it_is_when_another_takes_its_place(root):
     store = open_store(root, create=True)
     add_map(store, "old")
-    old = store.find_map("site")
+    old = store.scan().maps["site"]
     add_map(store, "new")
-    assert [read_tile(store, record) for record in (old, store.find_map("site"))] == [b"old", b"new"]
+    assert [read_tile(store, record) for record in (old, store.scan().maps["site"])] == [b"old", b"new"]
     assert list(store.scan().maps) == ["site"]
-    with pytest.raises(StoreError, match="no map 'other' in the store"):
-        store.find_map("other")
+    with pytest.raises(MapError, match="no map 'other' in the store; there are site"):
+        choose_maps(store, store.scan(), ["other"])
 
 
 @pytest.mark.parametrize("name", ["", ".", "../up", "a/b", "-x", "Ä"])

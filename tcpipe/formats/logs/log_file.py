@@ -22,7 +22,7 @@ from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs import bag_file, mcap_records, sqlite_file
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.bag_file import BagPart
-from tcpipe.formats.logs.log_part import FetchedFile, LogPart, MessageBlock
+from tcpipe.formats.logs.log_part import FetchedFile, LogPart, MessageBlock, join_hashes
 from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
 from tcpipe.formats.logs.rosbag2 import (
@@ -294,7 +294,7 @@ class Log(OpenLog):
         outlines = [part.outline for part in self._parts]
         if not all(outlines) or len(outlines) < len(self.files):
             return ""
-        return outlines[0] if len(outlines) == 1 else hashlib.sha256("".join(outlines).encode()).hexdigest()
+        return join_hashes(outlines)
 
     @property
     def is_known_by_outline(self) -> bool:

@@ -5,7 +5,6 @@ transforms only into the part in which they came: a later part that is read alon
 part in its folder.
 """
 
-import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -19,6 +18,7 @@ from tcpipe.errors import LogError
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.logs.log_file import Log, OpenLog, find_autopilot, open_log
+from tcpipe.formats.logs.log_part import join_hashes
 from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import AUTOPILOT_SUFFIXES, Mappings, find_table_run, is_log_file, is_table
@@ -54,9 +54,7 @@ class JoinedLog(OpenLog):
     def outline(self) -> str:
         """A hash of the indexes of all files; "" if one has none."""
         outlines = [log.outline for log in self._logs]
-        if not all(outlines):
-            return ""
-        return outlines[0] if len(outlines) == 1 else hashlib.sha256("".join(outlines).encode()).hexdigest()
+        return join_hashes(outlines) if all(outlines) else ""
 
     @property
     def is_known_by_outline(self) -> bool:
@@ -75,8 +73,7 @@ class JoinedLog(OpenLog):
 
     def sha256(self) -> str:
         """Return the hash of the log; of several, that of their hashes, in order."""
-        digests = [part.sha256 for part in self.parts]
-        return hashlib.sha256("".join(digests).encode()).hexdigest() if len(digests) > 1 else digests[0]
+        return join_hashes([part.sha256 for part in self.parts])
 
     def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
         """Return each topic's table over all files, in log-time order."""

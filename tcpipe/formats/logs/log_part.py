@@ -263,6 +263,11 @@ def outline_of(size: int, index: bytes | memoryview) -> str:
     return hashlib.sha256(size.to_bytes(8, "little") + bytes(index)).hexdigest()
 
 
+def join_hashes(hashes: Sequence[str]) -> str:
+    """Return the hash (hex) of several parts by those of each, in order; of one part its own."""
+    return hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
+
+
 def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:
     """Return whether compressed bytes claim an implausible size; ``whole``: this size is needed in memory."""
     ratio = _PLAUSIBLE_CHUNK_RATIO if whole else _PLAUSIBLE_RATIO

@@ -197,7 +197,7 @@ def _read_grey(dataset: Any, tile: Tile, raw: AnyArray, weights_rgb: tuple[float
     if dataset.colorinterp[tile.bands[0] - 1] == ColorInterp.palette:
         return np.asarray(_read_palette_grey(dataset.colormap(tile.bands[0]), weights_rgb)[raw[0]])
     weights = np.array(weights_rgb if len(tile.bands) == 3 else (1.0,)) * tile.scale[0]
-    return np.asarray(np.tensordot(weights, raw.astype(float), 1))
+    return np.tensordot(weights, raw.astype(float), 1)
 
 
 def read_tile(path: Path, role: str, use: Use) -> Tile:

@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.arrays import Floats, Ints, Mask
-from tcpipe.errors import DatasetError, MapError, StoreError, list_first
+from tcpipe.errors import DatasetError, MapError, StoreError, UsageError, list_first
 from tcpipe.formats.dataset_card import (
     DatasetCard,
     DatasetInputs,
@@ -39,7 +39,7 @@ from tcpipe.formats.runs import RunFacts, StoredMap
 from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
-from tcpipe.store import Store
+from tcpipe.store import Store, choose_maps
 from tcpipe.tables.columns import encode_rows, number_column, to_floats, to_integers
 from tcpipe.tables.findings import Finding, Findings, Remedy, Subject, make_finding
 from tcpipe.tables.levels import RESULTS_VERSION, TABLES_VERSION
@@ -83,8 +83,8 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> ChosenIn
     except DatasetError as error:
         problems += error.problems
     try:
-        records = choose_maps(store, state, options)
-    except DatasetError as error:
+        records = _choose_maps(store, state, options)
+    except (MapError, UsageError) as error:
         problems += error.problems
     if problems:
         raise DatasetError(*problems)
@@ -100,9 +100,9 @@ def choose_inputs(store: Store, options: BuildOptions, state: State) -> ChosenIn
 
 
 def plan_inputs(store: Store, options: BuildOptions, state: State) -> DatasetInputs:
-    """Return the inputs of a dataset from the documents alone; `DatasetError` as `choose_inputs`."""
+    """Return the inputs of a dataset from the documents alone; `TcpipeError` if runs or maps are missing."""
     chosen = choose_runs(store, options.recipe, state=state, robot=options.robot, tags=options.tags, prove=False)
-    return _describe_inputs(options, chosen.runs, choose_maps(store, state, options))
+    return _describe_inputs(options, chosen.runs, _choose_maps(store, state, options))
 
 
 def _describe_inputs(options: BuildOptions, runs: Sequence[StoredRun], maps: Sequence[StoredMap]) -> DatasetInputs:
@@ -172,24 +172,12 @@ def _hash_files(record: StoredMap) -> str:
     return digest({name: (checksum.size_bytes, checksum.sha256) for name, checksum in files.items()})
 
 
-def choose_maps(store: Store, state: State, options: BuildOptions) -> tuple[StoredMap, ...]:
-    """Return the maps to sample: the named ones in their order, or the only one; none for a dataset without patches."""
-    maps, names = state.maps, options.map_names
-    if options.without_patches or not (maps or names):
+def _choose_maps(store: Store, state: State, options: BuildOptions) -> tuple[StoredMap, ...]:
+    """Return the maps to sample, as `choose_maps`; none for a dataset without patches."""
+    if options.without_patches or not (state.maps or options.map_names):
         return ()
-    if not maps:
-        raise DatasetError(
-            f"{store.root}: no map {names[0]!r} in the store; add one: tcpipe add-map NAME --height FILE, or build without --map"
-        )
-    unknown = [name for name in names if name not in maps]
-    if unknown:
-        raise DatasetError(f"{store.root}: no map {unknown[0]!r} in the store; there are {', '.join(maps)}")
-    if not names and len(maps) > 1:
-        raise DatasetError(
-            f"{store.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map, or several; the first has "
-            "priority where they overlap"
-        )
-    return tuple(maps[name] for name in dict.fromkeys(names)) or tuple(maps.values())
+    hint = ", or several; the first has priority where they overlap"
+    return choose_maps(store, state, options.map_names, hint=hint)
 
 
 _OPTIONS = {

@@ -68,20 +68,17 @@ def test_a_recipe_that_fits_in_no_line_stands_below_its_finding():
 
 
 def test_findings_of_several_runs_are_one_line_a_code():
-    groups = group_findings([("a", [NOTE, slow(0.6)]), ("b", [slow(0.7)]), ("c", [EMPTY, NOTE])])
+    groups = group_findings([("a", [NOTE, slow(0.6)]), ("b", [slow(0.7)]), ("c", [EMPTY, NOTE])], 3)
     assert [(group.code, list(group.of)) for group in groups] == [
         ("no-segments", ["c"]), ("driven-below-limit", ["a", "b"]), ("no-command", ["a", "c"])
     ]  # fmt: skip
-    assert format_group(groups[0], 3).startswith("c: no segments from 12 m driven")
+    assert format_group(groups[0]).startswith("c: no segments from 12 m driven")
     title = "Most of the drive was commanded below the robot's maximum speed"
     assert (
-        format_group(groups[1], 3)
+        format_group(groups[1])
         == f"2 of 3 runs: {title} (command; 60 % to 70 %). To accept any speed: [mask] require_full_speed = false [driven-below-limit]"
     )
-    assert (
-        format_groups([(group, 3, "runs") for group in groups], more="tcpipe report STORE")[-1]
-        == "and 1 note: tcpipe report STORE"
-    )
+    assert format_groups(groups, more="tcpipe report STORE")[-1] == "and 1 note: tcpipe report STORE"
 
 
 def test_a_finding_of_another_version_or_without_its_fields_is_a_line_all_the_same():

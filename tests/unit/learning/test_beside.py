@@ -10,7 +10,7 @@ from tcpipe.dataset import Split, open_dataset
 from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import DatasetError, ModelError, UsageError
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.models import choose_model, load_model, set_speed
+from tcpipe.learning.models import load_model, set_speed
 from tcpipe.learning.predictions import predict_costs
 from tcpipe.learning.training import train
 from tcpipe.pipeline.verify import verify
@@ -87,7 +87,7 @@ def test_physics_is_a_model_like_the_others(told, tmp_path):
         model.predict(split.with_channels("height").patches)
     assert tcpipe("train", told, "model", "--model", "physics", cwd=tmp_path).stdout.startswith("model: nothing to do")
     with pytest.raises(UsageError, match="has no input for the commanded speed; remove --speed"):
-        choose_model(str(tmp_path / "model"), speed_mps=0.5)
+        set_speed(load_model(str(tmp_path / "model")), 0.5)
 
 
 def test_a_speed_that_nobody_drove_is_refused(told, tmp_path):
@@ -96,7 +96,7 @@ def test_a_speed_that_nobody_drove_is_refused(told, tmp_path):
     with pytest.raises(
         UsageError, match=r"--speed 2: .* trained at commanded speeds of 0\.5 to 1 m/s; give one of these"
     ):
-        choose_model(str(tmp_path / "model"), speed_mps=2.0)
+        set_speed(load_model(str(tmp_path / "model")), 2.0)
 
 
 def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch, caplog):

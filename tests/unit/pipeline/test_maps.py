@@ -69,7 +69,7 @@ def map_of(store, name="m"):
 
 def picture_of(store):
     opened = Store(store)
-    return Path(opened.place.where(opened.find_map("m").picture))
+    return Path(opened.place.where(opened.scan().maps["m"].picture))
 
 
 def test_a_second_identical_call_does_nothing_and_says_so_wherever_the_files_are(site, store, tmp_path):

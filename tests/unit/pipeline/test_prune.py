@@ -128,7 +128,7 @@ def test_what_a_dataset_refers_to_stays_until_it_is_forgotten_or_replaced(store,
 
 def test_replaced_documents_and_their_payload_go(store):
     add_world(store)
-    first = store.find_map("site").blob
+    first = store.scan().maps["site"].blob
     add_world(store)
     add_run(store, "c", segments("c", *lanes(np.array([2.0]), -10.0, 5.0)), recipe=OLD)
     tag_run(store, "c", {"weather": "wet"})

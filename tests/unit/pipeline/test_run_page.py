@@ -32,7 +32,7 @@ def store(tmp_path_factory):
 
 
 def path_of(store, name):
-    return Path(store.place.where(store.find_map(name).zarr))
+    return Path(store.place.where(store.scan().maps[name].zarr))
 
 
 def render(store):

@@ -60,7 +60,7 @@ def test_a_store_its_runs_and_its_map_verify(made):
         assert (found.problems, found.kind, found.read["runs"]) == ((), "run", 1)
     with pytest.raises(UsageError, match="nosuch"):
         verify("nosuch", store=store.root)
-    assert verify(store.map_at(store.find_map("site"))[0]).kind == "map"
+    assert verify(store.map_at(store.scan().maps["site"])[0]).kind == "map"
 
 
 def dress(store):
@@ -119,7 +119,7 @@ def test_a_manifest_that_counts_otherwise_is_found(copy):
 def test_strange_files_in_a_store_are_named_and_what_a_killed_command_left_behind(copy):
     root = copy("store")
     store = Store(root)
-    layers, run = store.map_at(store.find_map("site"))[0], store.find_runs("south")[0].folder.path
+    layers, run = store.map_at(store.scan().maps["site"])[0], store.find_runs("south")[0].folder.path
     strange = [root / "notes.txt", root / "maps" / "notes.json", run / "notes.txt", layers / "height" / "notes.txt"]
     strange += [root / "blobs" / "mine", root / "elsewhere"]
     desktop = [root / ".DS_Store", run / "Thumbs.db", root / "runs" / ".directory"]

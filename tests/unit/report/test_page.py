@@ -117,7 +117,7 @@ def test_a_remedy_is_the_lines_of_a_recipe_and_without_one_the_catalogue_advises
     assert purpose == "To accept any speed"
     assert recipe.startswith('[[power_sources]]\ntype = "std_msgs/msg/Float32"\n')
     lost = make_finding("lost-gap", Subject("run", "a"), severity="warning", lost_m=9.0, lost_fraction=0.2)
-    groups = [(group, 2, "runs") for group in group_findings([("a", [lost, lost]), ("b", [lost])])]
+    groups = group_findings([("a", [lost, lost]), ("b", [lost])], 2)
     (line,) = show_verdict(judge([]), groups=groups).shown
     assert line.title == read_catalogue()["lost-gap"].title
     assert line.observed[0][0].startswith("2 of 2 runs: ")
