@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, count_before
 from tcpipe.power.noise import compute_median_period_s
 from tcpipe.power.rails import Rail, SampledSignal, is_power_only
 from tcpipe.tables.bits import Quality
@@ -248,7 +248,7 @@ def touches_voltage_outside(
     outside = np.zeros(len(start_ns), dtype=bool)
     low, high = range_volt or (-np.inf, np.inf)
     for voltage in (rail.voltage for rail in rails if not is_power_only(rail.voltage.value)):
-        bad = np.concatenate(([0], np.cumsum((voltage.value < low) | (voltage.value > high))))
+        bad = count_before((voltage.value < low) | (voltage.value > high))
         first = np.maximum(np.searchsorted(voltage.stamp_ns, start_ns, side="right") - 1, 0)
         last = np.minimum(np.searchsorted(voltage.stamp_ns, end_ns, side="left") + 1, len(voltage.value))
         outside |= bad[last] > bad[first]

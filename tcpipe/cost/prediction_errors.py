@@ -36,7 +36,7 @@ import numpy as np
 from scipy.optimize import isotonic_regression, nnls
 from scipy.special import ndtr, ndtri, stdtrit
 
-from tcpipe.arrays import AnyInts, Floats, Ints, Mask, NamedArrays
+from tcpipe.arrays import AnyInts, Floats, Ints, Mask, NamedArrays, accumulate
 
 Stated = Floats | float | None
 Near = Mask | None
@@ -360,7 +360,7 @@ class _Held:
         pace, of_run = velocity[rows], run[rows]
         # Velocity is chord over time, so that neighbours are a chord apart.
         step_m = pace[:-1] * np.diff(start_ns[rows]) * 1e-9
-        way_m = np.concatenate([[0.0], np.cumsum(np.where(np.diff(of_run) == 0, step_m, 0.0))])
+        way_m = accumulate(np.where(np.diff(of_run) == 0, step_m, 0.0))
         true, predicted = (
             {"power": p[rows], "velocity": v[rows], "duration": 1.0 / v[rows], "energy": p[rows] / v[rows]}
             for p, v in ((power, velocity), (predicted_power, predicted_velocity))

@@ -9,7 +9,7 @@ since the first stamp.
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, accumulate
 from tcpipe.geometry.polyline import find_row_before
 
 _NS = 1e-9
@@ -58,7 +58,7 @@ def integrate_product_to(stamp_ns: Ints, a: Floats, b: Floats, at_ns: Ints) -> F
     at_ns : [ns], shape (M,), inside the span of ``stamp_ns``.
     """
     step_s = np.diff(stamp_ns) * _NS
-    whole = np.concatenate(([0.0], np.cumsum(_integrate_product(step_s, a[:-1], a[1:], b[:-1], b[1:]))))
+    whole = accumulate(_integrate_product(step_s, a[:-1], a[1:], b[:-1], b[1:]))
     row = find_row_before(stamp_ns, at_ns)
     part_s = (at_ns - stamp_ns[row]) * _NS
     share = part_s / step_s[row]
@@ -74,7 +74,7 @@ def integrate_held_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
     sum of the paper's Eq. 1. Parameters as in `integrate_to`.
     """
     step_s = np.diff(stamp_ns) * _NS
-    whole = np.concatenate(([0.0], np.cumsum(step_s * value[1:])))
+    whole = accumulate(step_s * value[1:])
     row = find_row_before(stamp_ns, at_ns)
     return whole[row] + (at_ns - stamp_ns[row]) * _NS * value[row + 1]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Floats, Ints
+from tcpipe.arrays import Floats, Ints, accumulate
 from tcpipe.compiled import compile_kernel
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -92,7 +92,7 @@ def fit_polyline(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats) -> Po
     row = np.arange(len(stamp_ns) - 1)
     step_s = np.diff(stamp_ns)[:, None] * _NS
     steps = _compute_partial_length_m(position_m[:, :2], velocity_mps[:, :2], row, np.ones((len(row), 1)), step_s)
-    return Polyline(stamp_ns, position_m, velocity_mps, np.concatenate(([0.0], np.cumsum(steps))))
+    return Polyline(stamp_ns, position_m, velocity_mps, accumulate(steps))
 
 
 def _locate(stamp_ns: Ints, at_ns: Ints) -> tuple[NDArray[np.intp], Floats, Floats]:

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import AnyArray, Ints, Mask
+from tcpipe.arrays import AnyArray, Ints, Mask, accumulate
 from tcpipe.tables.facts import ClockStep
 from tcpipe.tables.findings import Findings, Subject, make_finding, read_threshold
 
@@ -174,7 +174,7 @@ def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int
         ([0], (np.mean(np.abs(regular - 2.0) < _ABOUT_TWICE, axis=0) > _MOSTLY).astype(np.int8), [0])
     )
     begins, ends = np.flatnonzero(np.diff(twice) > 0), np.flatnonzero(np.diff(twice) < 0)
-    excess_s = np.concatenate(([0.0], np.cumsum(np.mean(regular - 1.0, axis=0)))) * STEP_NS / SECOND_NS
+    excess_s = accumulate(np.mean(regular - 1.0, axis=0)) * STEP_NS / SECOND_NS
     found = []
     for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
         step_s = float(excess_s[min(end + 1, size)] - excess_s[max(begin - 1, 0)])

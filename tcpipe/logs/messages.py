@@ -32,7 +32,7 @@ from tcpipe.tables.findings import Findings, Subject, make_finding, read_thresho
 
 LOG_TIME = "log_time_ns"
 GNSS, GNSS_VELOCITY = Subject("role", "gnss"), Subject("role", "gnss_velocity")
-_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+HEADER_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 Arrays = dict[str, AnyArray]
 
 
@@ -113,9 +113,10 @@ def count_frames(columns: Columns, type_name: str) -> dict[str, int]:
 
 def read_header_ns(columns: Columns) -> Ints | None:
     """Return header stamps [ns], 0 where unset; None if the message has no header."""
-    if _STAMP[0] not in columns:
+    if not set(HEADER_STAMP) <= columns.keys():
         return None
-    return columns[_STAMP[0]].astype(np.int64) * 1_000_000_000 + columns[_STAMP[1]].astype(np.int64)
+    seconds, nanoseconds = (columns[name].astype(np.int64) for name in HEADER_STAMP)
+    return np.asarray(seconds * 1_000_000_000 + nanoseconds)
 
 
 def _select_rows(columns: Columns, values: Arrays, drops: Mapping[str, Mask], **extra: Any) -> Readings:

@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, GenericArray, Ints, Mask
+from tcpipe.arrays import Bytes, GenericArray, Ints, Mask, number_within
 from tcpipe.logs.topics import normalize_type_name
 
 MAX_COLUMNS = 20_000
@@ -370,7 +370,7 @@ class _Cursors:
             places = Grid(begin.first, (*begin.shape, int(counts[0])), (*begin.strides, stride))
         else:
             owners = np.repeat(np.arange(len(rows)), counts)
-            places = begin[owners] + stride * (np.arange(len(owners)) - (np.cumsum(counts) - counts)[owners])
+            places = begin[owners] + stride * number_within(counts)
         total = int(counts.sum())
         return _Cursors(self._data, places, np.full(total, size), self._dialect).values(element, np.arange(total))
 
@@ -431,8 +431,8 @@ def _join_values(pieces: Sequence[Values], order: Ints) -> Values:
             lists = [p for p in pieces if isinstance(p, Lists)]
             counts = np.concatenate([p.counts for p in lists])
             starts, chosen = np.cumsum(counts) - counts, counts[order]
-            within = np.arange(int(chosen.sum())) - np.repeat(np.cumsum(chosen) - chosen, chosen)
-            return Lists(chosen, _join_values([p.elements for p in lists], np.repeat(starts[order], chosen) + within))
+            rows = np.repeat(starts[order], chosen) + number_within(chosen)
+            return Lists(chosen, _join_values([p.elements for p in lists], rows))
 
 
 @cache

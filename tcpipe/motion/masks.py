@@ -6,7 +6,7 @@ rows, shape (N,). A slowdown by terrain is the signal: with known commands, no f
 
 import numpy as np
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, count_before
 from tcpipe.motion.row_sections import (
     MotionRows,
     compute_window_mean,
@@ -75,7 +75,7 @@ def find_ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, abo
     persists. ``halted`` rows are stationary or turn in place.
     """
     speeding_up = np.sign(rows.velocity_mps) * acceleration_mps2
-    halts = np.concatenate(([0], np.cumsum(halted)))
+    halts = count_before(halted)
     found = np.zeros(len(halted), dtype=bool)
     for changes in (speeding_up > above_mps2, speeding_up < -above_mps2):
         going_on = ~drop_short_runs(~(changes | halted), rows.piece, min_rows=rows.count(min_s))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, accumulate
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ def compute_window_mean(value: Floats, piece: Ints, *, before: int, after: int) 
     ``before=10, after=-1`` is the ten rows ahead of k. NaN where the window is empty.
     """
     first, last = _make_window(piece, before, after)
-    total = np.concatenate(([0.0], np.cumsum(value)))
+    total = accumulate(value)
     count = last - first + 1
     mean = np.full(len(value), np.nan)
     np.divide(total[last + 1] - total[first], count, out=mean, where=count > 0)
@@ -112,7 +112,7 @@ def fit_slope(value: Floats, piece: Ints, *, half_window: int, period_s: float) 
     low, _ = find_piece_bounds(piece)
     position = np.arange(len(value)) - low
     level = value - value[low]
-    total, moment = (np.concatenate(([0.0], np.cumsum(x))) for x in (level, level * position))
+    total, moment = (accumulate(x) for x in (level, level * position))
     n = last - first + 1
     middle = 0.5 * (position[first] + position[last])
     covariance = (moment[last + 1] - moment[first]) - middle * (total[last + 1] - total[first])

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, accumulate, count_before
 
 LOW_HZ, HIGH_HZ = 3.0, 20.0
 LEAST_RATE_HZ = 2.5 * HIGH_HZ
@@ -55,7 +55,7 @@ def compute_vibration_mps2(
         ],
         axis=0,
     )
-    total = np.concatenate(([0.0], np.cumsum(square)))
+    total = accumulate(square)
     begin, end = (np.searchsorted(stamp_ns, at_ns, side="right") for at_ns in (start_ns, end_ns))
     mean_square = np.divide(total[end] - total[begin], end - begin, out=unknown.copy(), where=end > begin)
     known = _is_without_gap(stamp_ns, start_ns, end_ns, longest_s=_GAP_PERIODS * period_s)
@@ -90,7 +90,7 @@ def _filter_band(values: Floats, period_s: float) -> Floats:
 
 def _is_without_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_s: float) -> Mask:
     """Return which spans have no gap in them or near them."""
-    gaps = np.concatenate(([0], np.cumsum(np.diff(stamp_ns) * _NS > longest_s)))
+    gaps = count_before(np.diff(stamp_ns) * _NS > longest_s)
     last, near_ns = len(stamp_ns) - 1, round(_RINGS_S / _NS)
     before = np.searchsorted(stamp_ns, start_ns - near_ns, side="right") - 1
     after = np.searchsorted(stamp_ns, end_ns + near_ns, side="left")

@@ -15,7 +15,8 @@ from tcpipe.cost.labels import find_wanted_rate, is_too_slow
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.logs.message_tables import TableLog
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, SECOND_NS, SIMULATED_NS, TopicTimeline, TopicTimes, settle_clocks
+from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, SIMULATED_NS, TopicTimeline, TopicTimes, settle_clocks
+from tcpipe.logs.messages import HEADER_STAMP, read_header_ns
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic, split_notes
 from tcpipe.pipeline.log_sources import find_damaged_log, find_total_loss
@@ -30,7 +31,6 @@ from tcpipe.tables.facts import ClockStep
 from tcpipe.tables.findings import Finding, Findings, Subject, make_finding, omit, sort_findings
 
 _GAP_PERIODS, _GAP_NS = 3, 300_000_000
-_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 _TIMES = 2  # columns before the message's own: both times of the log
 
 
@@ -251,7 +251,8 @@ class TopicStamps:
         if not table.num_rows:
             return
         rows = table if self._last is None else pa.concat_tables([self._last, table])
-        header_ns, same = _read_header_ns(rows), np.zeros(rows.num_rows, bool)
+        stamps = {name: rows.column(name).to_numpy() for name in HEADER_STAMP if name in rows.column_names}
+        header_ns, same = read_header_ns(stamps), np.zeros(rows.num_rows, bool)
         if header_ns is not None:
             again = np.flatnonzero((np.diff(header_ns) == 0) & (header_ns[1:] != 0)) + 1
             same[again] = _find_repeated_rows(rows, again)
@@ -294,13 +295,6 @@ class TopicStamps:
             None if header_ns[0] is None else np.concatenate(header_ns),
             np.concatenate(same),
         )
-
-
-def _read_header_ns(table: pa.Table) -> Ints | None:
-    if not set(_STAMP) <= set(table.column_names):
-        return None
-    seconds, nanoseconds = (table.column(name).to_numpy().astype(np.int64) for name in _STAMP)
-    return np.asarray(seconds * SECOND_NS + nanoseconds)
 
 
 def _find_repeated_rows(table: pa.Table, rows: Ints) -> Mask:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tcpipe import __version__
+from tcpipe.arrays import accumulate
 from tcpipe.cost.adaptation import MeasuredRun, Metres, predict
 from tcpipe.cost.coverage import find_miscalibration, measure_coverage
 from tcpipe.cost.prediction_errors import COVERAGE
@@ -137,7 +138,7 @@ def predict_run(
     duration, class_id = values["chord_m"] / prediction.velocity_mps, prediction.terrain_class
     turning = find_added_turning(model)
     turn_joule = 0.0 if turning is None else turning.energy_joule(turn_rad, length_m, class_id, is_driven=True)
-    distance_m = np.insert(np.cumsum(np.linalg.norm(np.diff(start, axis=0), axis=1)), 0, 0.0)[: len(start)]
+    distance_m = accumulate(np.linalg.norm(np.diff(start, axis=0), axis=1))[: len(start)]
     energy = prediction.power_watt * duration + np.nan_to_num(turn_joule)
     both = {
         "duration": (duration, values["duration_s"], prediction.duration_std_s),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, accumulate
 from tcpipe.power.rails import Rail, interpolate_rail
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
@@ -35,7 +35,7 @@ def measure_rest_currents(rail: Rail, still_ns: Ints) -> Floats:
     inner_ns = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
     inner_ns = inner_ns[inner_ns[:, 1] - inner_ns[:, 0] >= _SHORTEST_HALT_NS]
     first, last = (np.searchsorted(rail.current.stamp_ns, at_ns) for at_ns in inner_ns.T)
-    sums = np.concatenate(([0.0], np.cumsum(rail.current.value)))
+    sums = accumulate(rail.current.value)
     used = last > first
     return np.asarray((sums[last] - sums[first])[used] / (last - first)[used])
 
@@ -80,7 +80,7 @@ class Sag:
     def products(self, edge_ns: Ints) -> tuple[Floats, Floats]:
         """Return the sums of voltage and of current, times the current's neighbours, up to each time, shape (E,)."""
         at = np.searchsorted(self.stamp_ns, edge_ns)
-        sums = (np.concatenate(([0.0], np.cumsum(values * self.neighbour_amp))) for values in (self.volt, self.amp))
+        sums = (accumulate(values * self.neighbour_amp) for values in (self.volt, self.amp))
         by_volt, by_amp = (cumulative[at] for cumulative in sums)
         return by_volt, by_amp
 

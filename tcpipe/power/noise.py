@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, accumulate, count_before
 from tcpipe.power.rails import Rail, SampledSignal, interpolate_rail, sum_power
 from tcpipe.power.sampling import estimate_smoothing_variance
 from tcpipe.tables.facts import Smoothing
@@ -139,7 +139,7 @@ def _sum_squared_shares(variance: Floats, edge_s: Floats, start_s: Floats, end_s
 
 def _estimate_rounding(signal: SampledSignal, start_ns: Ints, end_ns: Ints) -> Floats:
     """Return the variance of a signal on one level of its resolution, shape (M,): all its samples have one error."""
-    changes = np.append(0, np.cumsum(np.diff(signal.value) != 0))
+    changes = count_before(np.diff(signal.value) != 0)
     first, last = (changes[np.maximum(np.searchsorted(signal.stamp_ns, at) - 1, 0)] for at in (start_ns, end_ns))
     return np.asarray((estimate_resolution(signal) * (end_ns - start_ns) * _NS) ** 2 / 12.0 / (1 + last - first))
 
@@ -222,7 +222,7 @@ def estimate_local_scale(
     if model.curvature_variance <= 0.0:
         return np.ones(len(start_ns))
     near, used = signal.stamp_ns[1:-1], steady[1:-1]
-    sums, counts = (np.append(0.0, np.cumsum(each)) for each in (compute_curvature(signal) * used, used))
+    sums, counts = (accumulate(each) for each in (compute_curvature(signal) * used, used))
     first, last = np.searchsorted(near, start_ns - _LOCAL_NS), np.searchsorted(near, end_ns + _LOCAL_NS, side="right")
     expected = model.curvature_variance + model.error_variance
     local = (sums[last] - sums[first] + _PRIOR_SAMPLES * expected) / (counts[last] - counts[first] + _PRIOR_SAMPLES)
@@ -244,7 +244,7 @@ def _estimate_error_variance(signal: SampledSignal, still: Mask, period_s: float
     """
     count = max(_CALM_SAMPLES, round(_CALM_S / period_s))
     stationary = still[:-2] & still[1:-1] & still[2:]
-    squares, is_still = (np.append(0.0, np.cumsum(each)) for each in (compute_curvature(signal), stationary))
+    squares, is_still = (accumulate(each) for each in (compute_curvature(signal), stationary))
     means = (squares[count:] - squares[:-count]) / count
     calm = means[is_still[count:] - is_still[:-count] == count]
     if calm.size:
@@ -255,7 +255,7 @@ def _estimate_error_variance(signal: SampledSignal, still: Mask, period_s: float
 def _compute_second_differences(signal: SampledSignal, steady: Mask, period_s: float) -> Floats:
     """Return spacings, the variance of one sample by second differences at each, and their weights, shape (3, S)."""
     found, x, t = list[tuple[int, float, float]](), signal.value, signal.stamp_ns
-    unsteady = np.append(0, np.cumsum(~steady))
+    unsteady = count_before(~steady)
     for m in (each for each in _SPACINGS if 2 * each < len(x)):
         whole = unsteady[2 * m + 1 :] == unsteady[: -2 * m - 1]
         whole &= np.abs((t[2 * m :] - t[: -2 * m]) * _NS - 2 * m * period_s) < 0.5 * period_s

@@ -21,7 +21,7 @@ from typing import Literal
 
 import numpy as np
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, accumulate
 from tcpipe.geometry.piecewise_linear import integrate_held_to, integrate_product_to, interpolate
 
 _PERIODS = 3  # periods without a sample that are a gap, if the recipe allows less: single lost messages are no gap
@@ -189,7 +189,7 @@ def count_samples_inside(rails: list[Rail], start_ns: Ints, end_ns: Ints) -> tup
         before, until = (np.searchsorted(each.current.stamp_ns, at, side="right") for at in (start_ns, end_ns))
         samples = (until - before).astype(np.int64)
         count = samples if i == 0 else np.minimum(count, samples)
-        sums = np.concatenate(([0.0], np.cumsum(each.voltage_volt * each.current_amp)))
+        sums = accumulate(each.voltage_volt * each.current_amp)
         first, last = (np.searchsorted(each.stamp_ns, at, side="right") for at in (start_ns, end_ns))
         part = np.full(len(start_ns), np.nan)
         np.divide(sums[last] - sums[first], last - first, out=part, where=last > first)

@@ -116,7 +116,7 @@ def read_power(
     findings: list[Finding] = []
     gains: list[float] = []
     for topic, (type_name, columns) in topics.items():
-        if too_few := _find_too_few(topic, np.asarray(columns[_LOG_TIME], float)):
+        if too_few := _find_too_few(topic, _read_log_times(columns)):
             rejected += too_few
             continue
         choices = find_sources(type_name, topic, known, platform=platform, husky_power=husky_power)
@@ -135,7 +135,7 @@ def read_power(
         rails[topic] = found.rails if current_sign != "auto" else found.apply_type_signs()
     rails = _pair_rails(rails)
     rejected = rejected or _find_incomplete(rails)
-    log_times = {topic: np.asarray(columns[_LOG_TIME], float) for topic, (_, columns) in topics.items()}
+    log_times = {topic: _read_log_times(columns) for topic, (_, columns) in topics.items()}
     if not rejected:
         rails, excluded = _exclude_rows(rails, log_times)
         rails, wrapped = _undo_overflows(rails, log_times)
@@ -175,6 +175,10 @@ def read_power(
     )
 
 
+def _read_log_times(columns: Columns) -> Floats:
+    return np.asarray(columns[_LOG_TIME], float)
+
+
 def _scale_source(source: PowerSource, factor: float) -> PowerSource:
     """Return a source with its currents, powers, counters and torques multiplied."""
     scales = ("current_scale", "energy_scale", "torque_scale")
@@ -188,7 +192,7 @@ def _compare_charges(topics: Topics, rails: Rails) -> float | None:
         _, columns = topics[topic]
         charge_ah = _read_charge(columns)
         if charge_ah is not None and not is_power_only(of_topic[0].voltage_volt):
-            time_s = np.asarray(columns[_LOG_TIME], float) * 1e-9
+            time_s = _read_log_times(columns) * 1e-9
             ratios.append(compare_charge(time_s, np.sum([rail.current_amp for rail in of_topic], axis=0), charge_ah))
     return max((ratio for ratio in ratios if ratio), key=lambda ratio: abs(math.log(abs(ratio))), default=None)
 
@@ -240,7 +244,7 @@ def _sum_watt(columns: Columns, rails: Sequence[RailReadings]) -> tuple[Floats, 
     """Return the log times [ns] at which all rails of a topic have a power, and their sum [W]."""
     watt = np.sum([rail.voltage_volt * rail.current_amp for rail in rails], axis=0)
     known = np.isfinite(watt)
-    return np.asarray(columns[_LOG_TIME], float)[known], watt[known]
+    return _read_log_times(columns)[known], watt[known]
 
 
 def _find_sides(topics: Topics, sources: Sequence[PowerSource], rails: Rails, sign: int) -> Sides | None:
@@ -250,12 +254,12 @@ def _find_sides(topics: Topics, sources: Sequence[PowerSource], rails: Rails, si
         _, columns = topics[topic]
         of_sign = -1 if sources[0].sign == "drawn_negative" else 1
         first, second = (of_sign * sign * field.sign * read_values(columns, field) for field in fields_added)
-        return Sides(np.asarray(columns[_LOG_TIME], float), first, second)
+        return Sides(_read_log_times(columns), first, second)
     entries = _list_rails(rails)
     left, right = ([entry for entry in entries if side in entry[1].name.lower()] for side in ("left", "right"))
     if len(entries) != 2 or len(left) != 1 or len(right) != 1:
         return None
-    left_ns, right_ns = (np.asarray(topics[topic][1][_LOG_TIME], float) for topic, _ in (*left, *right))
+    left_ns, right_ns = (_read_log_times(topics[topic][1]) for topic, _ in (*left, *right))
     left_amp, right_amp = (rail.current_amp for _, rail in (*left, *right))
     known = np.isfinite(right_amp)
     return Sides(left_ns, left_amp, np.interp(left_ns, right_ns[known], right_amp[known]))

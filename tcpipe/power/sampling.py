@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, number_within
 from tcpipe.power.rails import Rail, Rule, SampledSignal, integrate_energy
 from tcpipe.tables.facts import Smoothing
 from tcpipe.tables.findings import read_threshold
@@ -89,8 +89,7 @@ def _find_arrivals(at_ns: Floats, changed: Ints, *, period_ns: float, message_ns
         anchor = np.concatenate(([begin], anchor, [end]))
         between = np.diff(anchor)
         count = np.maximum(np.rint(between / period_ns), 1.0).astype(np.int64)
-        step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        expected = np.repeat(anchor[:-1], count) + step * np.repeat(between / count, count)
+        expected = np.repeat(anchor[:-1], count) + number_within(count) * np.repeat(between / count, count)
         equal = np.setdiff1d(np.append(expected, end), at_ns[changed_rows])
         found += [changed_rows, np.maximum(np.searchsorted(at_ns, equal - 0.5 * message_ns), rows[0])]
     return np.unique(np.concatenate(found))

@@ -8,7 +8,7 @@ from dataclasses import astuple, dataclass, field
 
 import numpy as np
 
-from tcpipe.arrays import Floats
+from tcpipe.arrays import Floats, accumulate
 from tcpipe.compiled import compile_kernel
 from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED, World
 from tcpipe.tables.findings import omit
@@ -117,7 +117,7 @@ class SimulatedRobot:
         Solves U² - U0·U + R·P = 0 for the total power P; U0 falls with the energy drawn so far.
         """
         total = propulsion_watt + self.electronics_watt
-        drawn_joule = np.concatenate([[0.0], np.cumsum(total[:-1]) * dt_s])
+        drawn_joule = accumulate(total[:-1]) * dt_s
         open_circuit = self.open_circuit_volt - self.discharge_volt_per_megajoule * 1e-6 * drawn_joule
         voltage = 0.5 * (open_circuit + np.sqrt(open_circuit**2 - 4.0 * self.internal_resistance_ohm * total))
         return voltage, propulsion_watt / voltage

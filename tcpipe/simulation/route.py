@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from tcpipe.arrays import Bytes, Floats, Mask
+from tcpipe.arrays import Bytes, Floats, Mask, accumulate
 from tcpipe.errors import UsageError
 from tcpipe.geometry.rotation import invert, multiply, quat_from_matrix, rotation_vector_from_quat
 from tcpipe.simulation.robot import SimulatedRobot, compute_rolling_resistance, drive_along, make_correlated_noise
@@ -98,7 +98,7 @@ def make_leg_path(start_m: Floats, leg: Leg, *, weave: tuple[Floats, Floats, Flo
     offset = weave_m * (window * window * (3.0 - 2.0 * window)) * sway
     middle = np.column_stack([_integrate(np.cos(yaw)), _integrate(np.sin(yaw))]) + corners[0]
     points = middle + offset[:, None] * np.column_stack([-np.sin(yaw), np.cos(yaw)])
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    arc = accumulate(np.hypot(*np.diff(points, axis=0).T))
     stop_m, arc = float(np.interp(straight_m, s, arc)), arc[::10]
     return Path(CubicSpline(arc, points[::10]), float(arc[-1]), stop_m)
 
@@ -111,7 +111,7 @@ def make_straight_path(start_m: Floats, direction_rad: float, distance_m: float)
 
 
 def _integrate(values: Floats) -> Floats:
-    return np.concatenate([[0.0], np.cumsum(values[:-1] + values[1:]) * PATH_GRID_M / 2])
+    return accumulate(values[:-1] + values[1:]) * PATH_GRID_M / 2
 
 
 def _compute_curvature(corners: Floats, radius_m: float) -> tuple[Floats, float]:
@@ -138,7 +138,7 @@ def compute_moving_average(values: Floats, window_m: float) -> Floats:
     """Return the centred mean over ``window_m`` of values given every PATH_GRID_M; ends are held."""
     half = max(round(window_m / PATH_GRID_M / 2), 1)
     padded = np.concatenate([np.full(half, values[0]), values, np.full(half, values[-1])])
-    sums = np.concatenate([[0.0], np.cumsum(padded)])
+    sums = accumulate(padded)
     return np.asarray((sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1))
 
 
@@ -349,7 +349,7 @@ def _turn(place: Floats, yaw: float, angle_rad: float, robot: SimulatedRobot) ->
     hold_s = max(size / rate - rise_s, 0.0)
     t = np.arange(0.0, hold_s + 2.0 * rise_s + _DT_S, _DT_S)
     shape = np.clip(np.minimum(t, hold_s + 2.0 * rise_s - t) / rise_s, 0.0, 1.0)
-    swept = np.concatenate([[0.0], np.cumsum(shape[1:] + shape[:-1])])
+    swept = accumulate(shape[1:] + shape[:-1])
     zero = np.zeros(t.size)
     command = np.where(t < hold_s + rise_s, np.sign(angle_rad) * min(rate, size / rise_s), 0.0)
     return _Stretch(np.tile(place, (t.size, 1)), yaw + angle_rad * swept / swept[-1], zero, zero, zero, command)
@@ -420,8 +420,8 @@ def _make_truth(
         wheel_velocity_mps=driven.wheel_mps, slip=driven.slip, slope_rad=slope, terrain_class=terrain,
         command_velocity_mps=driven.command_mps, command_yaw_rate_radps=driven.command_radps,
         voltage_volt=voltage, current_amp=current, right_share=right_share, power_watt=voltage * current,
-        energy_joule=np.concatenate([[0.0], np.cumsum(energy_step)]),
-        distance_m=np.concatenate([[0.0], np.cumsum(np.hypot(*step.T))]),
+        energy_joule=accumulate(energy_step),
+        distance_m=accumulate(np.hypot(*step.T)),
     )  # fmt: skip
 
 

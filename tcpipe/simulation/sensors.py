@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, accumulate
 from tcpipe.geometry.rotation import invert, multiply, quat_from_rotation_vector, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.simulation.robot import GRAVITY_MPS2, make_correlated_noise
 from tcpipe.simulation.truth import Truth
@@ -481,7 +481,7 @@ def _remove_stretch(stamp: Ints, truth: Truth, rng: np.random.Generator, length_
 
 
 def _dead_reckon(velocity: Floats, yaw_rate: Floats, dt_s: float) -> tuple[Floats, Floats, Floats]:
-    yaw = np.concatenate([[0.0], np.cumsum(yaw_rate[1:] + yaw_rate[:-1]) * dt_s / 2])
+    yaw = accumulate(yaw_rate[1:] + yaw_rate[:-1]) * dt_s / 2
     step_x, step_y = velocity * np.cos(yaw) * dt_s, velocity * np.sin(yaw) * dt_s
     return np.cumsum(step_x) - step_x[0], np.cumsum(step_y) - step_y[0], (yaw + np.pi) % (2 * np.pi) - np.pi
 
@@ -502,7 +502,7 @@ def _mean_before(truth: Truth, values: Floats, stamp: Ints, period_ns: int) -> F
     if not period_ns:
         return np.interp(stamp, truth.stamp_ns, values)
     steps_s = np.diff(truth.stamp_ns) * 1e-9
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * steps_s)])
+    integral = accumulate(0.5 * (values[1:] + values[:-1]) * steps_s)
     start = np.maximum(stamp - period_ns, truth.stamp_ns[0])
     area = np.interp(stamp, truth.stamp_ns, integral) - np.interp(start, truth.stamp_ns, integral)
     return np.asarray(area / np.maximum((stamp - start) * 1e-9, 1e-12))

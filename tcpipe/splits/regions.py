@@ -14,7 +14,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from tcpipe.arrays import Bytes, Floats, Mask
+from tcpipe.arrays import Bytes, Floats, Mask, number_within
 
 Project = Callable[[Floats], Floats]
 Geometries = TypeVar("Geometries", BaseGeometry, NDArray[np.object_])
@@ -107,7 +107,7 @@ def _cut_lines(borders: BaseGeometry) -> NDArray[np.object_]:
     first = np.flatnonzero((within % _PIECE_EDGES == 0) & np.append(line[1:] == line[:-1], False))
     last = np.minimum(first + _PIECE_EDGES, np.append(begins[1:], len(line))[line[first]] - 1)
     counts = last - first + 1
-    at = np.repeat(first, counts) + np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    at = np.repeat(first, counts) + number_within(counts)
     return np.asarray(shapely.linestrings(xy_m[at], indices=np.repeat(np.arange(len(first)), counts)))
 
 

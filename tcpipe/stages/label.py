@@ -13,7 +13,7 @@ from tcpipe.cost.labels import Labels, SensorError, combine_flags, compute_label
 from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_physics
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
-from tcpipe.motion.row_sections import find_runs, number_pieces
+from tcpipe.motion.row_sections import find_runs
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m, find_common_scale_std
 from tcpipe.power.noise import estimate_energy_noise, estimate_resolution
 from tcpipe.power.rails import (
@@ -35,6 +35,7 @@ from tcpipe.stages.label_motion import (
     is_clock_doubtful,
     make_label_facts,
     make_motion_columns,
+    number_row_pieces,
     sum_energy_entries,
 )
 from tcpipe.stages.label_uncertainty import (
@@ -49,7 +50,16 @@ from tcpipe.stages.label_uncertainty import (
 from tcpipe.stages.label_witnesses import find_witnesses
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.bits import DropReason, Quality
-from tcpipe.tables.columns import make_lines, read_lonlat_deg, select_rows, to_floats, to_integers, to_numbers
+from tcpipe.tables.columns import (
+    make_lines,
+    read_lonlat_deg,
+    read_rise,
+    read_spans_ns,
+    select_rows,
+    to_floats,
+    to_integers,
+    to_numbers,
+)
 from tcpipe.tables.facts import PhysicsFacts, PowerSensorFacts
 from tcpipe.tables.levels import (
     LABELLED_SEGMENTS,
@@ -89,7 +99,7 @@ def label_segments(
             cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor, power=power
         )
         variance_j2.append(causes)
-        spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
+        spans = read_spans_ns(cut)
         count, mean_watt = count_samples_inside(rails, *spans)
         flags = {
             Quality.POWER_MEAN_MISMATCH: np.abs(mean_watt - cost.power_watt) > _MISMATCH * np.abs(cost.power_watt),
@@ -161,7 +171,7 @@ def compute_segment_costs(
 
     ``cut`` and ``rows`` are the epoch's segments and rows of the masked track.
     """
-    start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
+    (start_ns, end_ns), stamp_ns = read_spans_ns(cut), to_integers(rows, "stamp_ns")
     spans = start_ns, end_ns, find_stationary_ns(rows, info.rate_hz)
     noise = estimate_energy_noise(rails, *spans, smoothing=power.smoothing)
     better = estimate_energy_noise(rails, *spans, rate_hz=_BETTER_HZ, smoothing=power.smoothing)
@@ -198,7 +208,7 @@ def compute_segment_costs(
 
 def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> Floats:
     """Return the error of each segment's displacement [m], shape (M,): the smoother's, else by the rows' σ."""
-    start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
+    (start_ns, end_ns), stamp_ns = read_spans_ns(cut), to_integers(rows, "stamp_ns")
     duration_s = (end_ns - start_ns).astype(float) * 1e-9
     lag_std_m = np.column_stack([interpolate(stamp_ns, to_floats(rows, name), start_ns) for name in _DISPLACEMENTS])
     start_std_m, end_std_m = (
@@ -228,7 +238,7 @@ def find_idle_power(
     rows: pa.Table, rails: Mapping[int, list[Rail]], *, rate_hz: float, unsettled_s: tuple[float, float]
 ) -> IdlePower:
     """Return the idle power of a masked track, with σ; ``rails`` (by clock epoch) give the resolution."""
-    piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
+    piece = number_row_pieces(rows, rate_hz)
     standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STATIONARY)) != 0
     halt = np.full(rows.num_rows, -1)
     begin, end = (round((_EDGE_S + more_s) * rate_hz) for more_s in unsettled_s)
@@ -258,7 +268,7 @@ def make_fit_samples(table: pa.Table) -> FitSamples:
     return FitSamples(
         power_watt=to_floats(table, "power_watt"),
         velocity_mps=to_floats(table, "velocity_mps"),
-        rise=(to_floats(table, "end_z_m") - to_floats(table, "start_z_m")) / to_floats(table, "chord_m"),
+        rise=read_rise(table),
         mean_abs_yaw_rate_radps=to_floats(table, "mean_abs_yaw_rate_radps"),
         terrain=np.array(names, np.str_),
     )

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, accumulate
 from tcpipe.cost.labels import (
     Labels,
     estimate_energy_budget,
@@ -29,7 +29,7 @@ from tcpipe.motion.vibration import compute_vibration_mps2
 from tcpipe.power.noise import compute_median_period_s
 from tcpipe.power.rails import Rail, Rule, integrate_recorded_energy
 from tcpipe.tables.bits import DropReason, Quality, flag_name
-from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_numbers
+from tcpipe.tables.columns import read_spans_ns, select_rows, stack_floats, to_floats, to_integers, to_numbers
 from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts
 from tcpipe.tables.findings import Finding, Findings, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo
@@ -48,7 +48,7 @@ def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: T
     """
     epoch = int(to_integers(cut, "clock_epoch")[0])
     imu = select_rows(streams.tables["imu"], "clock_epoch", epoch) if "imu" in streams.tables else None
-    spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
+    spans = read_spans_ns(cut)
     stamp_ns, middle_ns = to_integers(rows, "stamp_ns"), spans[0] + (spans[1] - spans[0]) // 2
     return {
         **_compute_turns(cut, rows, imu, info),
@@ -59,7 +59,7 @@ def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: T
 
 
 def _compute_turns(cut: pa.Table, rows: pa.Table, imu: pa.Table | None, info: TrackInfo) -> Arrays:
-    stamp_ns, start_ns, end_ns = to_integers(rows, "stamp_ns"), to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
+    stamp_ns, (start_ns, end_ns) = to_integers(rows, "stamp_ns"), read_spans_ns(cut)
     yaw_rad = np.unwrap(to_floats(rows, "yaw_rad"))
     yaw_change_rad = interpolate(stamp_ns, yaw_rad, end_ns) - interpolate(stamp_ns, yaw_rad, start_ns)
     duration_s, arc_m = (end_ns - start_ns) * 1e-9, to_floats(cut, "arc_length_m")
@@ -95,7 +95,7 @@ def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> Float
 def _compute_slip(cut: pa.Table, rows: pa.Table, cost: Labels) -> Arrays:
     """Return the slip and its standard deviation, by the distance over ground and the wheels' white noise."""
     stamp_ns, wheel_mps = to_integers(rows, "stamp_ns"), to_floats(rows, "wheel_velocity_mps")
-    mean_mps = mean_between(stamp_ns, wheel_mps, to_integers(cut, "start_ns"), to_integers(cut, "end_ns"))
+    mean_mps = mean_between(stamp_ns, wheel_mps, *read_spans_ns(cut))
     rolling_mps = np.where(np.abs(mean_mps) > _ROLLING_MPS, mean_mps, np.nan)
     ratio = to_floats(cut, "fused_velocity_mps") / rolling_mps
     noise_mps = estimate_white_noise(wheel_mps[np.isfinite(wheel_mps), None])
@@ -109,7 +109,7 @@ def _compute_vibration(imu: pa.Table | None, start_ns: Ints, end_ns: Ints) -> Ar
     """Return the vibration and its standard deviation; NaN without an IMU that measures specific force with gravity."""
     found = np.full(len(start_ns), np.nan), np.full(len(start_ns), np.nan)
     if imu is not None:
-        force = np.column_stack([to_floats(imu, f"linear_acceleration_{axis}_mps2") for axis in "xyz"])
+        force = stack_floats(imu, *(f"linear_acceleration_{axis}_mps2" for axis in "xyz"))
         is_known = np.isfinite(force).all(axis=1)
         low, high = GRAVITY_BAND_MPS2  # outside (other unit, gravity removed) the vibration is unknown
         if is_known.any() and low <= float(np.median(np.linalg.norm(force[is_known], axis=1))) <= high:
@@ -122,7 +122,7 @@ Flags = dict[Quality, Mask]
 
 def find_power_flags(cut: pa.Table, rails: list[Rail], *, range_volt: tuple[float, float] | None) -> Flags:
     """Return the flags of one epoch's segments by its power samples; without a range [V] no voltage is outside it."""
-    spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
+    spans = read_spans_ns(cut)
     return {
         Quality.LOW_POWER_RATE: np.full(cut.num_rows, has_low_power_rate(rails)),
         Quality.VOLTAGE_OUT_OF_RANGE: touches_voltage_outside(rails, *spans, range_volt=range_volt),
@@ -137,10 +137,10 @@ def find_motion_flags(
     A segment is flagged if it is more curved than ``arc_to_chord`` or an end is less certain than
     ``max_position_std_m`` [m].
     """
-    stamp_ns, start_ns, end_ns = to_integers(rows, "stamp_ns"), to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
+    stamp_ns, (start_ns, end_ns) = to_integers(rows, "stamp_ns"), read_spans_ns(cut)
     chord_m = to_floats(cut, "chord_m")
     wheel_mps = mean_between(stamp_ns, to_floats(rows, "wheel_velocity_mps"), start_ns, end_ns)
-    driven_m = np.concatenate(([0.0], np.cumsum(np.hypot(*(np.diff(to_floats(rows, f"{axis}_m")) for axis in "xy")))))
+    driven_m = accumulate(np.hypot(*(np.diff(to_floats(rows, f"{axis}_m")) for axis in "xy")))
     start_m, end_m = (interpolate(stamp_ns, driven_m, at_ns) for at_ns in (start_ns, end_ns))
     mask, commanded_mps = info.report.facts.mask, to_floats(cut, "commanded_velocity_mps")
     full_speed_mps = mask.full_speed_mps if mask else None
@@ -166,7 +166,7 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> Mask:
         read_threshold("measurements-rejected", "max_rejected_fraction"),
         read_threshold("changes-unlikely", "max_change_count"),
     )
-    start_ns, end_ns, epoch = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(cut, "clock_epoch")
+    (start_ns, end_ns), epoch = read_spans_ns(cut), to_integers(cut, "clock_epoch")
     facts = info.report.facts
     times: list[tuple[int, int, int]] = []
     for section in facts.fuse.stretches if facts.fuse else ():
@@ -179,9 +179,14 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> Mask:
     return disputed
 
 
+def number_row_pieces(rows: pa.Table, rate_hz: float) -> Ints:
+    """Return for each row of a track the number of its uninterrupted piece, as `number_pieces`, shape (N,)."""
+    return number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
+
+
 def _find_gap_edges(rows: pa.Table, rate_hz: float) -> Mask:
     """Return the rows that are in a gap of a sensor, or next to a gap of the track."""
-    piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
+    piece = number_row_pieces(rows, rate_hz)
     hole = np.diff(piece) != 0
     edge: Mask = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.GAP)) != 0
     edge[:-1] |= hole
@@ -307,7 +312,7 @@ def sum_energy_entries(rows: pa.Table, rails: list[Rail], *, rate_hz: float, rul
     after the track). ``rate_hz`` is the track's.
     """
     stamp_ns = to_integers(rows, "stamp_ns")
-    piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
+    piece = number_row_pieces(rows, rate_hz)
     reason = find_interval_reason(to_numbers(rows["dropped_by"]), piece)
     spent = integrate_recorded_energy(rails, stamp_ns[:-1], stamp_ns[1:], rule=rule)
     record = _integrate_whole_record(rails, rule)

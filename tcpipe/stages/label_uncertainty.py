@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tcpipe.arrays import Floats, Ints
 from tcpipe.cost.labels import SensorError
 from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
-from tcpipe.motion.row_sections import find_runs, number_pieces
+from tcpipe.motion.row_sections import find_runs
 from tcpipe.power.audit import (
     Sag,
     estimate_offset_std,
@@ -34,8 +34,9 @@ from tcpipe.power.witnesses import estimate_missing_std_fraction
 from tcpipe.recipe import LabelConfig
 from tcpipe.recipe.suggestions import Keys, suggest
 from tcpipe.robots import GAIN_STD_FRACTION, OFFSET_STD_AMP
+from tcpipe.stages.label_motion import number_row_pieces
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.columns import select_rows, to_floats, to_integers, to_numbers
+from tcpipe.tables.columns import read_rise, read_spans_ns, select_rows, to_floats, to_integers, to_numbers
 from tcpipe.tables.facts import LabelFacts, PhysicsFacts, PowerSensorFacts, PowerSign, StageFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Streams, TrackInfo
@@ -44,7 +45,7 @@ from tcpipe.tables.levels import Streams, TrackInfo
 def find_stationary_ns(rows: pa.Table, rate_hz: float, *, but: int = 0) -> Ints:
     """Return begin and end [ns] of the spans that are stationary and have none of the reasons ``but``, shape (S, 2)."""
     stamp_ns = to_integers(rows, "stamp_ns")
-    piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
+    piece = number_row_pieces(rows, rate_hz)
     reasons = to_numbers(rows["dropped_by"])
     standing = ((reasons & np.uint32(DropReason.STATIONARY)) != 0) & ((reasons & np.uint32(but)) == 0)
     return stamp_ns[find_runs(standing, piece)]
@@ -240,14 +241,14 @@ def find_unpowered_motion(
 
 def make_sensor_error(cut: pa.Table, rails: list[Rail], facts: PowerSensorFacts, *, rule: Rule) -> SensorError:
     """Return one epoch's segment errors by the power sensor: zeros of rails are independent, gains are common."""
-    spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
+    spans = read_spans_ns(cut)
     offsets = [
         integrate_energy(
             [replace(rail, current_amp=np.full_like(rail.current_amp, facts.offset_std_amp))], *spans, rule=rule
         )
         for rail in rails
     ]
-    rise = (to_floats(cut, "end_z_m") - to_floats(cut, "start_z_m")) / to_floats(cut, "chord_m")
+    rise = read_rise(cut)
     lost = find_lost_signs(measure_sag(rails), *spans, rise)
     # Returned energy counts as drawn: the error is twice this energy.
     sign_joule = np.where(lost, np.abs(integrate_energy(rails, *spans, rule=rule)), 0.0)
@@ -260,7 +261,7 @@ _MOTION = (*FIXES, WHEELS, VISUAL)  # roles of the independent sensors of motion
 
 def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts) -> NDArray[np.int32]:
     """Return how many sensors measured motion in each segment of one epoch and were fused, shape (M,)."""
-    start_ns, end_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
+    start_ns, end_ns = read_spans_ns(cut)
     epoch = int(to_integers(cut, "clock_epoch")[0])
     count = np.zeros(cut.num_rows, dtype=np.int32)
     for sensor in (role for role in _MOTION if role in streams.tables):

@@ -15,7 +15,7 @@ from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
 from tcpipe.power.witnesses import IMPLAUSIBLE, RESISTANCE_OHM, compute_weight_ratio, estimate_climb
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Robot
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import read_rise, read_spans_ns, to_floats, to_integers
 from tcpipe.tables.facts import StageFacts
 from tcpipe.tables.findings import NOTHING, WITNESSES_OF_LABEL, Affected, Finding, Subject, make_finding, read_threshold
 
@@ -141,8 +141,8 @@ def _compare_power(table: pa.Table, facts: StageFacts, robot: Robot) -> tuple[li
     if robot.mass_kg is None:
         missing.append("mass unknown")
     else:
-        rise = (to_floats(table, "end_z_m") - to_floats(table, "start_z_m")) / to_floats(table, "chord_m")
-        start_ns, end_ns = to_integers(table, "start_ns"), to_integers(table, "end_ns")
+        rise = read_rise(table)
+        start_ns, end_ns = read_spans_ns(table)
         climb = estimate_climb(
             power_watt=power_watt,
             velocity_mps=to_floats(table, "velocity_mps"),

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tcpipe.arrays import Floats, Mask
+from tcpipe.arrays import Floats, Mask, count_before
 from tcpipe.errors import FusionError
 from tcpipe.fusion.measurements import DISPLACEMENT_LAGS_S
 from tcpipe.motion import masks
@@ -16,7 +16,7 @@ from tcpipe.recipe import MaskConfig, TimeWindow
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import MAX_PLAUSIBLE_MPS
 from tcpipe.tables.bits import DropReason, flag_name
-from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.columns import stack_floats, to_floats, to_integers
 from tcpipe.tables.facts import MaskFacts
 from tcpipe.tables.findings import Finding, Findings, Remedy, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import MASKED_TRACK, TRACK, MaskedTrack, Track, add_findings
@@ -233,8 +233,8 @@ def find_gaps(
     moving = np.abs(rows.velocity_mps) >= config.turning_velocity_mps
     uncertain = moving & (_compute_chord_std_m(track, rows, chord_m, config) > config.max_relative_position_std_m)
     table, stamp_ns = track.table, to_integers(track.table, "stamp_ns")
-    position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
-    velocity_mps = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    position_m = stack_floats(table, "x_m", "y_m", "z_m")
+    velocity_mps = stack_floats(table, "east_velocity_mps", "north_velocity_mps", "up_velocity_mps")
     off_m = np.append(compute_unexplained_m(stamp_ns, position_m, velocity_mps, rows.piece), 0.0)
     jumps = np.zeros(len(moving), dtype=bool)
     steps = np.flatnonzero(off_m > config.max_relative_position_std_m)
@@ -267,7 +267,7 @@ def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config:
     table = track.table
     course = np.arctan2(to_floats(table, "north_velocity_mps"), to_floats(table, "east_velocity_mps"))
     common_mps = _compute_common_std_mps(track)
-    lag_std_m = np.column_stack([to_floats(table, name) for name in _DISPLACEMENTS])
+    lag_std_m = stack_floats(table, *_DISPLACEMENTS)
     return compute_chord_ahead_std_m(
         rows,
         velocity_std_mps=_subtract_variance(to_floats(table, "forward_velocity_std_mps"), common_mps),
@@ -314,7 +314,7 @@ def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: flo
         return implausible, ()
     driving_mps = speed_mps[speed_mps > _DRIVES_MPS]
     window = min(driving_mps.size, rows.count(_WINDOW_S))
-    faster = np.concatenate(([0], np.cumsum(driving_mps > limit_mps)))
+    faster = count_before(driving_mps > limit_mps)
     run, median_mps = Subject("run", track.info.run_id), float(np.median(driving_mps))
     numbers = {"fast_s": implausible.sum() * rows.period_s, "limit_mps": limit_mps, "median_mps": median_mps}
     if 2 * int((faster[window:] - faster[:-window]).max()) > window:

@@ -16,7 +16,7 @@ from tcpipe.logs.extrinsics import Transforms
 from tcpipe.logs.messages import LOG_TIME, Arrays
 from tcpipe.logs.topics import Topic
 from tcpipe.power.rails import Rail, make_rail, make_samples
-from tcpipe.tables.columns import Tables, select_rows, to_floats, to_integers, to_numbers, to_texts
+from tcpipe.tables.columns import Tables, select_rows, stack_floats, to_floats, to_integers, to_numbers, to_texts
 from tcpipe.tables.levels import STREAMS, Streams
 
 T = TypeVar("T", bound=np.generic)
@@ -251,7 +251,7 @@ def use_pose_as_fixes(streams: Streams) -> tuple[Streams, bool]:
     pose, facts = streams.tables[POSE], streams.report.facts
     is_local = bool(np.isnan(to_floats(pose, "lon_deg")).any())
     if is_local:
-        place = np.column_stack([to_floats(pose, f"{axis}_m") for axis in "xyz"])
+        place = stack_floats(pose, "x_m", "y_m", "z_m")
         names = ("lon_deg", "lat_deg", "alt_m")
         geodetic = dict(zip(names, geodetic_from_enu(place, datum_deg_m=_ANYWHERE_DEG_M), strict=True))
         pose = STREAMS[POSE].table(**{name: pose[name] for name in pose.column_names} | geodetic)

@@ -18,7 +18,7 @@ from tcpipe.power.witnesses import compute_side_share
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import Profiles
-from tcpipe.tables.columns import Tables, select_rows, to_floats, to_integers, to_texts
+from tcpipe.tables.columns import Tables, select_rows, stack_floats, to_floats, to_integers, to_texts
 from tcpipe.tables.findings import Finding, Findings, Severity, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import STREAMS
 
@@ -192,7 +192,7 @@ def _compute_power_at_currents(rail: pa.Table) -> tuple[Ints, Floats]:
 
 
 def _test_by_motion(power_ns: Ints, watt: Floats, motion: pa.Table) -> bool | None:
-    twist = np.column_stack([to_floats(motion, name) for name in ("velocity_x_mps", "angular_velocity_z_radps")])
+    twist = stack_floats(motion, "velocity_x_mps", "angular_velocity_z_radps")
     moving = np.isfinite(twist).all(axis=1)
     return is_stated_averaged(power_ns, watt, to_integers(motion, "stamp_ns")[moving], *twist[moving].T)
 

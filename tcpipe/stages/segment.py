@@ -21,7 +21,7 @@ from tcpipe.motion.row_sections import number_pieces
 from tcpipe.path import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig
 from tcpipe.tables.bits import DropReason, Loss, flag_name
-from tcpipe.tables.columns import to_floats, to_integers, to_numbers
+from tcpipe.tables.columns import stack_floats, to_floats, to_integers, to_numbers
 from tcpipe.tables.facts import SegmentFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import SEGMENTS, MaskedTrack, Segments, TrackInfo, add_findings
@@ -34,8 +34,8 @@ def segment_track(masked: MaskedTrack, config: SegmentConfig) -> Segments:
     """Return the segments of the track's steady sections, and the distance breakdown, whose sum is the odometer."""
     table, info = masked.table, masked.info
     stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch")
-    position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
-    velocity_mps = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    position_m = stack_floats(table, "x_m", "y_m", "z_m")
+    velocity_mps = stack_floats(table, "east_velocity_mps", "north_velocity_mps", "up_velocity_mps")
     piece = number_pieces(stamp_ns, epoch, period_ns=1e9 / info.rate_hz)
     dropped_by = to_numbers(table["dropped_by"])
     reason = find_interval_reason(dropped_by, piece)

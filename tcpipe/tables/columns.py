@@ -205,6 +205,16 @@ def read_lonlat_deg(table: pa.Table, end: str) -> Floats:
     return stack_floats(table, f"{end}_lon_deg", f"{end}_lat_deg")
 
 
+def read_spans_ns(segments: pa.Table) -> tuple[Ints, Ints]:
+    """Return start and end of segments [ns], shape (N,) each."""
+    return to_integers(segments, "start_ns"), to_integers(segments, "end_ns")
+
+
+def read_rise(segments: pa.Table) -> Floats:
+    """Return the rise of the track over each segment per metre of its chord, shape (N,)."""
+    return (to_floats(segments, "end_z_m") - to_floats(segments, "start_z_m")) / to_floats(segments, "chord_m")
+
+
 def read_ends_m(segments: pa.Table) -> tuple[Floats, Floats]:
     """Return east and north of start and end of segments in their own frames [m], null as NaN, (N, 2) each."""
     return stack_floats(segments, "start_x_m", "start_y_m"), stack_floats(segments, "end_x_m", "end_y_m")

@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
-from tcpipe.arrays import Floats, Ints, Mask
+from tcpipe.arrays import Floats, Ints, Mask, accumulate
 from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.sampling_kernel import compute_morton
@@ -167,7 +167,7 @@ def _thin_track(xy_m: Floats, height_m: Floats) -> tuple[Floats, Floats]:
     """Return finite points half a metre of path apart, or further apart if there are too many."""
     is_finite = np.isfinite(xy_m).all(axis=1) & np.isfinite(height_m)
     xy_m, height_m = xy_m[is_finite], height_m[is_finite]
-    path_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(xy_m, axis=0).T)))[: len(xy_m)]
+    path_m = accumulate(np.hypot(*np.diff(xy_m, axis=0).T))[: len(xy_m)]
     spacing_m = max(_SPACING_M, path_m[-1] / _MOST_POINTS) if path_m.size else _SPACING_M
     rows = np.unique((path_m / spacing_m).astype(np.int64), return_index=True)[1]
     return xy_m[rows], height_m[rows]

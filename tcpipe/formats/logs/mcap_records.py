@@ -9,7 +9,7 @@ import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints, Mask
+from tcpipe.arrays import Ints, Mask, number_within
 from tcpipe.formats.logs.chunk_reading import Messages
 from tcpipe.formats.logs.log_part import ByteSource, DamageError, gather_integers, outline_of
 
@@ -206,8 +206,7 @@ def index_messages(data: bytes, records: Ints, ends: Ints, channels: Ints) -> tu
         )
     counts = np.where(right, size // 16, 0)
     record = np.repeat(np.arange(len(records)), counts)
-    within = np.arange(len(record)) - np.repeat(np.cumsum(counts) - counts, counts)
-    places = records[record] + (RECORD_HEAD + 6) + 16 * within
+    places = records[record] + (RECORD_HEAD + 6) + 16 * number_within(counts)
     if not len(places):
         return right, record, places, places
     return right, record, gather_integers(data, places, "i8"), gather_integers(data, places + 8, "i8")

@@ -15,7 +15,7 @@ from typing import TypeGuard
 
 import numpy as np
 
-from tcpipe.arrays import Bytes, Floats
+from tcpipe.arrays import Bytes, Floats, accumulate
 from tcpipe.errors import PathError
 from tcpipe.formats.atomic import write_atomic_file, write_text
 from tcpipe.formats.geojson import shorten_problems, shorten_value
@@ -109,7 +109,7 @@ _POSE_M = 0.25  # largest distance of neighbouring poses of a path message [m]: 
 
 def make_path_message(xy_m: Floats) -> Json:
     """Return a ``nav_msgs/Path`` along points in the frame ``map`` [m], shape (P, 2), with the course as yaw."""
-    away_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))]
+    away_m = accumulate(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))
     between_m = np.linspace(0.0, away_m[-1], int(np.ceil(away_m[-1] / _POSE_M)) + 1)
     along_m = np.unique(np.r_[away_m, between_m])
     points = np.column_stack([np.interp(along_m, away_m, column) for column in xy_m.T])
