@@ -8,7 +8,7 @@ import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -35,17 +35,21 @@ def find_recipe_with_source(explicit: str | None) -> tuple[Path | None, str]:
 @contextmanager
 def show_progress(what: str, *, quiet: bool, as_json: bool = False) -> Iterator[Progress]:
     """Show progress on stderr: bars on a terminal, else lines, none with ``quiet``; with ``--debug`` only its log."""
-    logger = logging.getLogger("tcpipe")
-    debugging = logger.isEnabledFor(logging.DEBUG)
+    debugging = logging.getLogger("tcpipe").isEnabledFor(logging.DEBUG)
     shown = Progress(what, quiet=quiet, console=None if quiet or debugging else _open_terminal(as_json=as_json))
-    handler = _Lines(shown)
+    with nullcontext() if debugging else _listen(_Lines(shown), logging.ERROR if quiet else STEP), shown:
+        yield shown
+
+
+@contextmanager
+def _listen(handler: logging.Handler, level: int) -> Iterator[None]:
+    """Give a handler the messages of the package from ``level`` on."""
+    logger = logging.getLogger("tcpipe")
     before = logger.level
-    if not debugging:
-        logger.setLevel(logging.ERROR if quiet else STEP)
-        logger.addHandler(handler)
+    logger.addHandler(handler)
+    logger.setLevel(level)
     try:
-        with shown:
-            yield shown
+        yield
     finally:
         logger.removeHandler(handler)
         logger.setLevel(before)
@@ -205,18 +209,9 @@ class _Lines(logging.Handler):
             self._shown.line(record.getMessage())
 
 
-@contextmanager
-def write_debug_log() -> Iterator[None]:
+def write_debug_log() -> AbstractContextManager[None]:
     """Log every step with its time to stderr, and the cause of each error."""
-    logger, handler = logging.getLogger("tcpipe"), _DebugLog()
-    before = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(logging.DEBUG)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(before)
+    return _listen(_DebugLog(), logging.DEBUG)
 
 
 class _DebugLog(logging.Handler):

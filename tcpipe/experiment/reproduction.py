@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tcpipe.errors import DatasetError, clean_lines
 from tcpipe.experiment.benchmark import BenchmarkRow, list_tables, run_benchmark
@@ -161,8 +161,8 @@ def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
     ingested = ingest(site.logs, store=store, recipe=RECIPE, jobs=jobs)
     if problems := [problem for result in ingested.results for problem in result.problems]:
         raise DatasetError(*problems)
-    height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
-    add_map("site", height=height, ortho=ortho, terrain=terrain, classes=classes, store=store)
+    rasters: dict[str, Any] = site.rasters
+    add_map("site", **rasters, store=store)
     built = build_dataset(place / "dataset", store=store, split=site.region, recipe=RECIPE, jobs=jobs, force=True)
     logger.info("%s", str(built).splitlines()[0])
 

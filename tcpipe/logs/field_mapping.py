@@ -53,15 +53,15 @@ def _map_orientation(message: str) -> dict[str, MappedField]:
     return {f"orientation_{c}": MappedField(f"{message}.{c}", "1") for c in "xyzw"}
 
 
-def _map_pose(prefix: str, *, needed: str = "") -> dict[str, MappedField]:
-    place = {axis: MappedField(f"{prefix}.position.{axis}", "m", axis in needed) for axis in "xyz"}
-    return place | _map_orientation(f"{prefix}.orientation")
+def _map_pose(*, needed: str = "") -> dict[str, MappedField]:
+    place = {axis: MappedField(f"pose.pose.position.{axis}", "m", axis in needed) for axis in "xyz"}
+    return place | _map_orientation("pose.pose.orientation")
 
 
 _ODOMETRY = {
     **_map_vector("linear", "twist.twist.linear", "m/s", needed="x"),
     **_map_vector("angular", "twist.twist.angular", "rad/s"),
-    **_map_pose("pose.pose"),
+    **_map_pose(),
 }
 
 MAPPED: dict[str, dict[str, MappedField]] = {
@@ -97,7 +97,7 @@ MAPPED: dict[str, dict[str, MappedField]] = {
         **_map_vector("linear", "twist.linear", "m/s", needed="x"),
         **_map_vector("angular", "twist.angular", "rad/s"),
     },
-    "pose": {**_map_pose("pose.pose", needed="xy"), **_map_std("pose.covariance", ("x", "y", "z"), 6)},
+    "pose": {**_map_pose(needed="xy"), **_map_std("pose.covariance", ("x", "y", "z"), 6)},
 }
 """Fields that can be mapped, by role and short name."""
 

@@ -433,13 +433,15 @@ def _read_imu(columns: Columns) -> Readings:
 _POSE = ("x_m", "y_m", "z_m", "quat_x", "quat_y", "quat_z", "quat_w")
 
 
-def _read_body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[Arrays, Floats]:
+def _read_body_twist(columns: Columns, prefix: str) -> tuple[Arrays, Floats]:
     """Return a twist's columns, null where it is not measured, and the twist as published, shape (N, 6)."""
     linear, angular = _read_vector(columns, f"{prefix}.linear"), _read_vector(columns, f"{prefix}.angular")
     twist = np.concatenate((linear, angular), -1)
-    unmeasured = _find_unmeasured(columns, covariance, twist)
+    unmeasured = _find_unmeasured(columns, "twist.covariance", twist)
     linear, angular = (np.where(unmeasured[:, part], np.nan, twist[:, part]) for part in (slice(3), slice(3, 6)))
-    variances = np.where(unmeasured[:, [0, 1, 2, 5]], np.nan, _read_variances(columns, covariance, 0, 7, 14, 35))
+    variances = np.where(
+        unmeasured[:, [0, 1, 2, 5]], np.nan, _read_variances(columns, "twist.covariance", 0, 7, 14, 35)
+    )
     values = {
         **_name_axes("velocity", "mps", linear),
         **_name_axes("angular_velocity", "radps", angular),
@@ -450,7 +452,7 @@ def _read_body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[Ar
 
 
 def _read_odometry(columns: Columns, role: str) -> Readings:
-    values, twist = _read_body_twist(columns, "twist.twist", "twist.covariance")
+    values, twist = _read_body_twist(columns, "twist.twist")
     position = _read_vector(columns, "pose.pose.position")
     quat, bad = _read_orientation(columns, "pose.pose.orientation")
     pose = np.concatenate((position, quat), -1)
@@ -468,7 +470,7 @@ def _read_odometry(columns: Columns, role: str) -> Readings:
 
 def _read_twist_stamped(columns: Columns) -> Readings:
     with_covariance = "twist.twist.linear.x" in columns
-    values, twist = _read_body_twist(columns, "twist.twist" if with_covariance else "twist", "twist.covariance")
+    values, twist = _read_body_twist(columns, "twist.twist" if with_covariance else "twist")
     values |= {name: np.full(len(twist), np.nan) for name in _POSE}
     return _select_rows(columns, values, {"not_finite": ~np.isfinite(twist.sum(-1))})
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.atomic import check_new, clear
@@ -68,12 +69,10 @@ def run_demo(directory: Path, *, seed: int, begin_part: Callable[..., None]) -> 
     ingested = ingest(site.logs, store=store_path, recipe=Recipe())
     if problems := [problem for result in ingested.results for problem in result.problems]:
         raise DatasetError(*problems)
-    height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
-    rasters = f"--height {height} --ortho {ortho} --ortho-bands rgb --terrain {terrain} --classes {classes}"
-    begin(2, text=f"$ tcpipe add-map site {rasters}")
-    added = add_map(
-        "site", height=height, ortho=ortho, ortho_bands="rgb", terrain=terrain, classes=classes, store=store_path
-    )
+    rasters: dict[str, Any] = site.rasters
+    options = " ".join(f"--{name} {path}" for name, path in rasters.items())
+    begin(2, text=f"$ tcpipe add-map site {options} --ortho-bands rgb")
+    added = add_map("site", **rasters, ortho_bands="rgb", store=store_path)
     begin(3, text=f"$ tcpipe build-dataset {dataset_path} --split {site.region}")
     built = build_dataset(dataset_path, store=store_path, split=site.region, recipe=Recipe(), force=True)
     begin(4, text=f"$ tcpipe report {dataset_path}")

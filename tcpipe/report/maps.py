@@ -29,6 +29,7 @@ from tcpipe.report.plots import Plot, lay_picture, make_map_plot, make_plot
 from tcpipe.store import Store
 from tcpipe.tables.columns import read_ends_m, read_lonlat_deg, stack_floats
 from tcpipe.terrain.layers import TerrainClass
+from tcpipe.terrain.tiles import find_map_projection
 
 Pictures = Mapping[str, str]
 """Pictures of a map by name, as data URIs; the first is visible."""
@@ -247,11 +248,7 @@ def _find_ground(
     for name, record in maps.records.items():
         try:
             source = open_map(*maps.store.map_at(record))
-            transformer = Transformer.from_crs(run.manifest.recipe.read.gnss_crs, source.grid.crs, always_xy=True)
-
-            def to_map(places_deg: Floats, transformer: Transformer = transformer) -> Floats:
-                return np.column_stack(transformer.transform(*places_deg.T)).reshape(-1, 2)
-
+            to_map = find_map_projection(source, run.manifest.recipe.read.gnss_crs).forward
             if source.grid.contains(to_map(lonlat)).mean() > _LEAST_SHARE:
                 if name not in maps.pictures:
                     maps.pictures[name] = _draw_pictures(source)

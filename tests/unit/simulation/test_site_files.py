@@ -146,7 +146,7 @@ def test_a_second_call_does_nothing_and_what_is_something_else_stays(tmp_path):
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
     assert simulate(out, scenario=tiny).unchanged
     for place, seed in ((out, 2), (tmp_path, 1)):
-        with pytest.raises(UsageError, match="is not this simulated site"):
+        with pytest.raises(UsageError, match="is no site of scenario"):
             simulate(place, scenario=tiny, seed=seed)
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
     assert list(tmp_path.iterdir()) == [out]
