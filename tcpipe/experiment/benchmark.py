@@ -153,12 +153,7 @@ def _train(dataset: Location, here: Path, config: FitConfig, predictor: str | No
 
 
 def _summarize(  # noqa: PLR0917
-    name: str,
-    kind: str,
-    made: Sequence[Evaluation],
-    tables: Sequence[pa.Table],
-    runs: Texts,
-    training_s: float,
+    name: str, kind: str, made: Sequence[Evaluation], tables: Sequence[pa.Table], runs: Texts, training_s: float
 ) -> Iterator[BenchmarkRow]:
     splits, classes = (to_texts(tables[0].column(column)) for column in ("split", "terrain_name"))
     for split, part in made[0].splits.items():

@@ -24,7 +24,7 @@ from tcpipe.arrays import AnyArray, Floats, Ints
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import Location, write_atomic_file
 from tcpipe.formats.json_files import to_json_line
-from tcpipe.tables.columns import read_lonlat_deg
+from tcpipe.tables.columns import read_ends_deg
 from tcpipe.tables.levels import GEOMETRY, Datum
 
 N = TypeVar("N", bound=np.generic)
@@ -250,7 +250,7 @@ _WGS84 = "EPSG:4326"
 
 def add_segments_metadata(table: pa.Table, datum: Datum | None) -> pa.Table:
     """Return a table of segments with its coordinate system as metadata; ``datum`` is the track's."""
-    ends = np.concatenate([read_lonlat_deg(table, "start"), read_lonlat_deg(table, "end")])
+    ends = np.concatenate(read_ends_deg(table))
     return add_geo_metadata(table, "LineString", ends, crs=_WGS84 if datum is None else datum.crs)
 
 

@@ -168,11 +168,7 @@ def _find_quality(kind: Ints) -> Floats:
 
 def _turn_axes(name: str, forward: Floats, right: Floats, down: Floats) -> dict[str, Floats]:
     """Return a vector's components forward, left and up."""
-    return {
-        f"{name}_x": forward.astype(float),
-        f"{name}_y": -right.astype(float),
-        f"{name}_z": -down.astype(float),
-    }
+    return {f"{name}_x": forward.astype(float), f"{name}_y": -right.astype(float), f"{name}_z": -down.astype(float)}
 
 
 # ---------------------------------------------------------------- PX4

@@ -19,10 +19,9 @@ from tcpipe.formats.published_outputs import fetch_directory
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.findings import Finding, Findings, Subject
+from tcpipe.tables.levels import LABEL_STD
 
-_LABELS = ("power_watt", "velocity_mps", "duration_s", "energy_joule")
-_STDS = ("power_std_watt", "velocity_std_mps", "duration_std_s", "energy_std_joule")
-_LABELLED = (*_LABELS, "fused_velocity_mps", *_STDS)
+_LABELLED = {*LABEL_STD, *LABEL_STD.values(), "fused_velocity_mps"}
 _DRAWN = ("split", "fold")
 _SHARED = 0.9  # smallest shared fraction of the time of two samples that are compared
 
@@ -71,7 +70,7 @@ def diff(a: Location, b: Location) -> Difference:
     cards = read_card(first), read_card(second)
     columns = [sample_columns(directory) for directory in (first, second)]
     shared = [name for name in columns[0] if name in columns[1]]
-    tables = tuple(read_samples(directory, ["sample_id", "split", *_LABELS]) for directory in (first, second))
+    tables = tuple(read_samples(directory, ["sample_id", "split", *LABEL_STD]) for directory in (first, second))
     at = pc.index_in(tables[0].column("sample_id"), value_set=tables[1].column("sample_id").combine_chunks())
     row = at.to_numpy(zero_copy_only=False)  # value of b for each of a, NaN if it is missing
     in_a = np.flatnonzero(np.isfinite(row))
@@ -110,7 +109,7 @@ def diff(a: Location, b: Location) -> Difference:
                 for end, table in zip("ab", tables, strict=True)
                 for what in ("mean", "std")
             }
-            for name in _LABELS
+            for name in LABEL_STD
             if all(map(len, tables))
         },
         changes=_measure_changes((first, second)),
@@ -135,8 +134,8 @@ def _read_values(table: pa.Table, name: str) -> Floats:
 
 def _measure_changes(directories: tuple[Path, Path]) -> dict[str, dict[str, float]]:
     matched = _match_by_time(*(read_samples(directory, ["run_id", "start_ns", "end_ns"]) for directory in directories))
-    found, std_of = dict[str, dict[str, float]](), dict(zip(_LABELS, _STDS, strict=True))
-    for name in (*_LABELS, *_STDS):
+    found = dict[str, dict[str, float]]()
+    for name in (*LABEL_STD, *LABEL_STD.values()):
         ours, theirs = (
             _read_values(read_samples(directory, [name]), name)[rows]
             for directory, rows in zip(directories, matched, strict=True)
@@ -147,7 +146,7 @@ def _measure_changes(directories: tuple[Path, Path]) -> dict[str, dict[str, floa
             continue
         count, change = int(known.sum()), change[known]
         found[name] = {"samples": count, "median": float(np.median(change)), "largest": float(change.max())}
-        if std := std_of.get(name):
+        if std := LABEL_STD.get(name):
             std_a = _read_values(read_samples(directories[0], [std]), std)[matched[0]][known]
             found[name]["largest_in_std"] = float((change[std_a > 0.0] / std_a[std_a > 0.0]).max(initial=0.0))
     return found

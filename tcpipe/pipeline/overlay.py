@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,8 @@ from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
 from tcpipe.splits.audit import PLACES
 from tcpipe.store import find_named_run
 from tcpipe.tables.bits import DropReason, Quality, flag_names
-from tcpipe.tables.columns import make_text_column, to_numbers, to_texts
-from tcpipe.tables.levels import GEOMETRY
+from tcpipe.tables.columns import make_text_column, stack_floats, to_numbers, to_texts
+from tcpipe.tables.levels import GEOMETRY, LABEL_STD
 
 GEOJSON = "foxglove_msgs/msg/GeoJSON"
 _FRAME = "tcpipe_enu"
@@ -35,9 +36,6 @@ _SEGMENT_COLOUR, _DROPPED_COLOUR = "#1a9850", "#d73027"
 _DIAGONAL_KNOWN = 2
 _ROWS_A_VERTEX = 20  # time between vertices of dropped sections [s]
 
-_LABELS = (
-    "power_watt", "power_std_watt", "velocity_mps", "velocity_std_mps", "duration_s", "duration_std_s", "energy_joule", "energy_std_joule",
-)  # fmt: skip
 _ROS_TYPES = {
     pa.float64(): "float64", pa.int64(): "int64", pa.int32(): "int32", pa.int16(): "int16", pa.uint32(): "uint32", pa.string(): "string",
 }  # fmt: skip
@@ -183,7 +181,7 @@ def _make_fixes(rows: pa.Table, times: Ints) -> MessageStream:
         for name, unit in (("longitude", "deg"), ("latitude", "deg"), ("altitude", "m"))
     }
     covariance = np.zeros((len(times), 9))
-    covariance[:, ::4] = np.stack([_read_column(rows, f"{axis}_std_m") for axis in "xyz"], axis=-1) ** 2
+    covariance[:, ::4] = stack_floats(rows, "x_std_m", "y_std_m", "z_std_m") ** 2
     constants = {"header.frame_id": "base_link", "position_covariance_type": _DIAGONAL_KNOWN}
     return MessageStream(f"{OVERLAY}fix", NAV_SAT_FIX, times, columns | {"position_covariance": covariance}, constants)
 
@@ -230,7 +228,8 @@ def _make_line(lonlat: Sequence[Sequence[float]], colour: str, properties: Mappi
 
 def _iterate_segment_lines(segments: pa.Table) -> Iterator[dict[str, Any]]:
     """Yield a GeoJSON line a segment, with its labels and quality."""
-    for row in segments.select(["segment_id", *PLACES, *_LABELS, "quality_names"]).to_pylist():
+    labels = chain.from_iterable(LABEL_STD.items())
+    for row in segments.select(["segment_id", *PLACES, *labels, "quality_names"]).to_pylist():
         lonlat = [row.pop(name) for name in PLACES]
         yield _make_line([lonlat[:2], lonlat[2:]], _SEGMENT_COLOUR, {"name": row["segment_id"], **row})
 
@@ -242,7 +241,7 @@ def _iterate_dropped_lines(rows: pa.Table) -> Iterator[dict[str, Any]]:
         _read_column(rows, "dropped_by"),
         _read_column(rows, "clock_epoch"),
     )
-    lonlat = np.stack([_read_column(rows, "lon_deg"), _read_column(rows, "lat_deg")], axis=-1)
+    lonlat = stack_floats(rows, "lon_deg", "lat_deg")
     breaks = np.flatnonzero((np.diff(bits.astype(np.int64)) != 0) | (np.diff(epoch) != 0)) + 1
     for part in np.split(np.arange(len(bits)), breaks):
         if len(part) > 1 and bits[part[0]]:

@@ -27,14 +27,7 @@ from numpy.typing import NDArray
 from tcpipe.arrays import Bytes, Floats, Floats32
 from tcpipe.cost.prediction_errors import QuantityErrors
 from tcpipe.errors import MapError, StoreError, clean_lines
-from tcpipe.formats.atomic import (
-    Location,
-    check_new,
-    clear_beside,
-    lock_directory,
-    make_scratch_directory,
-    write_text,
-)
+from tcpipe.formats.atomic import Location, check_new, clear_beside, lock_directory, make_scratch_directory, write_text
 from tcpipe.formats.integrity import FileChecksums, compute_checksums, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.maps.geotiff import read_bands, write_cog

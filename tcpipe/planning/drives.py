@@ -33,7 +33,7 @@ from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles
 from tcpipe.stages.sample import Shifts
 from tcpipe.store import Store, open_store, take_one_run
 from tcpipe.tables.bits import flag_names
-from tcpipe.tables.columns import read_lonlat_deg, to_floats
+from tcpipe.tables.columns import read_ends_deg, to_floats
 from tcpipe.tables.findings import PREDICTED, Finding, Findings, Subject, Verdict, judge, make_finding, read_threshold
 from tcpipe.terrain.sampling import make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
@@ -132,7 +132,7 @@ def predict_run(
     measured, length_m = to_floats(segments, ENERGIES[model.card.label_energy].energy), values["arc_length_m"]
     turn_rad = values["mean_abs_yaw_rate_radps"] * values["duration_s"]
     projection = find_map_projection(source, gnss_crs or run.manifest.recipe.read.gnss_crs)
-    start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift[:2] for name in ("start", "end"))
+    start, end = (projection.forward(ends_deg) + shift[:2] for ends_deg in read_ends_deg(segments))
     frames = make_patch_frames(start, end, values["chord_m"])
     prediction = predict_segments(model, source, frames, turn_radpm=turn_rad / length_m)
     duration, class_id = values["chord_m"] / prediction.velocity_mps, prediction.terrain_class

@@ -214,12 +214,7 @@ _MIN_CORRELATION = 0.7  # smallest correlation at which a second meter measures 
 
 
 def compare_second_meters(
-    power: PowerReadings,
-    topics: Topics,
-    meters: Topics,
-    known: Sequence[PowerSource],
-    *,
-    platform: str | None = None,
+    power: PowerReadings, topics: Topics, meters: Topics, known: Sequence[PowerSource], *, platform: str | None = None
 ) -> PowerReadings:
     """Return the power with the slope of the most contradictory second meter; ``meters``: power topics not used."""
     series = [_sum_watt(topics[topic][1], rails) for topic, rails in power.rails.items()]

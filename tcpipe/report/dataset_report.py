@@ -36,7 +36,7 @@ from tcpipe.report.plots import Plot, draw_waterfall
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.stages.sample import separate_frames
 from tcpipe.store import Store, is_store
-from tcpipe.tables.columns import read_ends_m, read_lonlat_deg, to_floats
+from tcpipe.tables.columns import read_ends_deg, read_ends_m, to_floats
 
 MOST_SAMPLES = 100_000
 """On the page: of more the first ones, since their order is random."""
@@ -285,7 +285,7 @@ def _read_middles_m(card: DatasetCard, table: pa.Table) -> Floats:
         frame = frames[_find_indices(table, "run_id", [run.run_id for run in card.runs])]
         return np.asarray(np.mean(separate_frames(frame, read_ends_m(table)), axis=0))
     to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.plane_crs, always_xy=True)
-    middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
+    middle_deg = np.mean(read_ends_deg(table), axis=0)
     return np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
 
 

@@ -27,7 +27,7 @@ from tcpipe.report.pictures import (
 )
 from tcpipe.report.plots import Plot, lay_picture, make_map_plot, make_plot
 from tcpipe.store import Store
-from tcpipe.tables.columns import read_ends_m, read_lonlat_deg, stack_floats
+from tcpipe.tables.columns import read_ends_deg, read_ends_m, stack_floats
 from tcpipe.terrain.layers import TerrainClass
 from tcpipe.terrain.tiles import find_map_projection
 
@@ -208,8 +208,8 @@ def draw_run_map(run: StoredRun, track: pa.Table, segments: pa.Table, maps: Stor
     plot = _draw_track(("easting [m]", "northing [m]"), xy_m, make_legend(classes.classes if classes else ()))
     for number, (name, uri) in enumerate(pictures.items()):
         lay_picture(plot, name, uri, source.grid.bounds_m, visible=number == 0)
-    ends_xy_m = to_map(read_lonlat_deg(segments, "start")), to_map(read_lonlat_deg(segments, "end"))
-    return RunMap(plot, xy_m, ends_xy_m, tuple(pictures), tuple(missing), is_complete)
+    start_m, end_m = map(to_map, read_ends_deg(segments))
+    return RunMap(plot, xy_m, (start_m, end_m), tuple(pictures), tuple(missing), is_complete)
 
 
 def draw_tracks(runs: Sequence[StoredRun], maps: StoredMaps) -> Plot | None:

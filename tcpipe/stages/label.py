@@ -52,7 +52,7 @@ from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import (
     make_lines,
-    read_lonlat_deg,
+    read_ends_deg,
     read_rise,
     read_spans_ns,
     select_rows,
@@ -123,7 +123,7 @@ def label_segments(
                 power_samples=count,
                 confirming_sensor_count=count_confirming_sensors(cut, streams, masked.info.report.facts),
                 quality=combine_flags(flags, cut.num_rows),
-                geometry=make_lines(*(read_lonlat_deg(cut, end) for end in ("start", "end"))),
+                geometry=make_lines(*read_ends_deg(cut)),
             )
         )
     table = pa.concat_tables(parts).combine_chunks()

@@ -12,7 +12,7 @@ from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.bits import Loss
-from tcpipe.tables.columns import read_ends_m, read_lonlat_deg, to_floats
+from tcpipe.tables.columns import read_ends_deg, read_ends_m, to_floats
 from tcpipe.tables.findings import Findings, Subject, make_finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.projection import Projection
@@ -81,7 +81,7 @@ def sample_segments(
     shift_m = np.zeros((segments.num_rows, 3))
     if shifts:
         shift_m[:] = [shifts.get(run_id, (0.0, 0.0, 0.0)) for run_id in segments.column("run_id").to_pylist()]
-    start, end = (projection.forward(read_lonlat_deg(segments, name)) + shift_m[:, :2] for name in ("start", "end"))
+    start, end = (projection.forward(ends_deg) + shift_m[:, :2] for ends_deg in read_ends_deg(segments))
     frames = make_patch_frames(start, end, chord_m)
     corners = compute_footprints(frames, config.patch_m)
     lost_by = np.zeros(segments.num_rows, np.uint32)
@@ -119,7 +119,7 @@ def place_segments(segments: pa.Table, place: Projection | AnyInts, config: Samp
     """
     count = segments.num_rows
     if isinstance(place, Projection):
-        start, end = (place.forward(read_lonlat_deg(segments, name)) for name in _ENDS)
+        start, end = map(place.forward, read_ends_deg(segments))
     else:
         start, end = separate_frames(place, read_ends_m(segments))
     corners = compute_footprints(make_patch_frames(start, end, to_floats(segments, "chord_m")), config.patch_m)
@@ -148,7 +148,6 @@ def place_segments(segments: pa.Table, place: Projection | AnyInts, config: Samp
     )
 
 
-_ENDS = ("start", "end")
 _FRAME_STEP_M = 100.0
 """Step by which local frames are moved [m]: split blocks of 1, 2, 5, 10, 20, 25 or 50 m stay whole."""
 

@@ -215,6 +215,11 @@ def read_rise(segments: pa.Table) -> Floats:
     return (to_floats(segments, "end_z_m") - to_floats(segments, "start_z_m")) / to_floats(segments, "chord_m")
 
 
+def read_ends_deg(segments: pa.Table) -> tuple[Floats, Floats]:
+    """Return longitude and latitude of start and end of segments [deg], null as NaN, (N, 2) each."""
+    return read_lonlat_deg(segments, "start"), read_lonlat_deg(segments, "end")
+
+
 def read_ends_m(segments: pa.Table) -> tuple[Floats, Floats]:
     """Return east and north of start and end of segments in their own frames [m], null as NaN, (N, 2) each."""
     return stack_floats(segments, "start_x_m", "start_y_m"), stack_floats(segments, "end_x_m", "end_y_m")

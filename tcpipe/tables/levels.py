@@ -372,6 +372,14 @@ _LABEL_COLUMNS = (
     Column("quality", pa.uint32(), "bits", "limitations of the label, 0 = none", flags=Quality),
 )
 
+LABEL_STD = {
+    "power_watt": "power_std_watt",
+    "velocity_mps": "velocity_std_mps",
+    "duration_s": "duration_std_s",
+    "energy_joule": "energy_std_joule",
+}
+"""Column of the standard deviation of each label, w, v, T, E."""
+
 LABELLED_SEGMENTS = TableSchema(
     "segments",
     "L5",

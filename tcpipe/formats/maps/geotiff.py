@@ -529,12 +529,7 @@ def _read_again(path: Path) -> None:
 
 
 def write_cog(
-    path: Path,
-    strip: Callable[[int, int], AnyArray],
-    grid: MapGrid,
-    *,
-    dtype: str,
-    bands: Sequence[tuple[str, str]],
+    path: Path, strip: Callable[[int, int], AnyArray], grid: MapGrid, *, dtype: str, bands: Sequence[tuple[str, str]]
 ) -> None:
     """Write a Cloud-Optimised GeoTIFF as `write_geotiff`; overviews contain every second pixel, without averaging.
 

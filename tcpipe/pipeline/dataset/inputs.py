@@ -40,7 +40,7 @@ from tcpipe.formats.stored_runs import StoredRun
 from tcpipe.pipeline.dataset.options import BuildOptions
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
 from tcpipe.store import Store, choose_maps
-from tcpipe.tables.columns import encode_rows, number_column, to_floats, to_integers
+from tcpipe.tables.columns import encode_rows, number_column, read_ends_deg, read_spans_ns, to_integers
 from tcpipe.tables.findings import Finding, Findings, Remedy, Subject, make_finding
 from tcpipe.tables.levels import RESULTS_VERSION, TABLES_VERSION
 
@@ -263,10 +263,7 @@ def remove_duplicates(runs: Sequence[StoredRun]) -> tuple[tuple[StoredRun, ...],
         run = runs[index]
         names = [f"{end}_{what}" for end in ("start", "end") for what in ("ns", "lon_deg", "lat_deg")]
         table = run.table("segments", names)
-        middle = [
-            (to_floats(table, f"start_{axis}_deg") + to_floats(table, f"end_{axis}_deg")) / 2 for axis in ("lon", "lat")
-        ]
-        return _SegmentPositions(to_integers(table, "start_ns"), to_integers(table, "end_ns"), np.column_stack(middle))
+        return _SegmentPositions(*read_spans_ns(table), np.mean(read_ends_deg(table), axis=0))
 
     duplicates: dict[str, Mask] = {}
     findings: list[Finding] = []

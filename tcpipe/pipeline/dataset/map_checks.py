@@ -20,7 +20,7 @@ from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.robust import estimate_shorth
 from tcpipe.stages.sample import Sampled, Shifts
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.columns import read_lonlat_deg, to_floats
+from tcpipe.tables.columns import read_ends_deg, to_floats
 from tcpipe.tables.findings import Finding, Findings, Subject, make_finding, read_threshold
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.registration import REACH_M, HeightScale, Registration, register_track
@@ -256,7 +256,7 @@ def find_driven_obstacles(
     """
     runs = segments.column("run_id").combine_chunks().dictionary_encode()
     run, run_ids = runs.indices.to_numpy(zero_copy_only=False), runs.dictionary.to_pylist()
-    lonlat_deg = (read_lonlat_deg(segments, "start") + read_lonlat_deg(segments, "end")) / 2.0
+    lonlat_deg = np.mean(read_ends_deg(segments), axis=0)
     length_m, class_id = to_floats(segments, "arc_length_m"), np.zeros(segments.num_rows, np.int64)
     grounds = [(source, moved) for source, moved in zip(sources, shifts, strict=True) if "terrain" in source.layers]
     for source, moved in grounds:
