@@ -17,7 +17,15 @@ import numpy as np
 
 from tcpipe.arrays import Ints, Mask
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_part import Bounds, ByteSource, DamageError, FetchedFile, LogPart, MessageBlock
+from tcpipe.formats.logs.log_part import (
+    Bounds,
+    ByteSource,
+    DamageError,
+    FetchedFile,
+    LogPart,
+    MessageBlock,
+    split_by_channel,
+)
 from tcpipe.logs.topics import Topic
 
 GROUP_BYTES = 1 << 23
@@ -75,27 +83,6 @@ class Messages:
         """Return the entries of some rows."""
         columns = (self.channel, self.offset, self.payload, self.length, self.log_time_ns, self.publish_time_ns)
         return Messages(self.data, *(values[chosen] for values in columns))
-
-    def blocks(self, ordinal: Ints) -> list[MessageBlock]:
-        """Return them as one block a channel; ``ordinal`` is their order within the file, shape (N,)."""
-        if (self.channel[1:] < self.channel[:-1]).any():
-            order = np.argsort(self.channel, kind="stable")
-            return self.at(order).blocks(ordinal[order])
-        if not len(self.channel):
-            return []
-        starts = [0, *((self.channel[1:] != self.channel[:-1]).nonzero()[0] + 1).tolist()]
-        return [
-            MessageBlock(
-                int(self.channel[a]),
-                self.data,
-                self.payload[a:b],
-                self.length[a:b],
-                self.log_time_ns[a:b],
-                self.publish_time_ns[a:b],
-                ordinal[a:b],
-            )
-            for a, b in zip(starts, [*starts[1:], len(self.channel)], strict=True)
-        ]
 
 
 class PlacedChunk(Protocol):
@@ -238,11 +225,12 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
 
     def _split_in_time(self, messages: Messages, ordinal: Ints) -> list[MessageBlock]:
         """Return messages as blocks, without those with a time of more than 63 bits."""
-        times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
-        if not times.all():
-            self._note("time-invalid", messages_lost=int((~times).sum()))
-            messages, ordinal = messages.at(times), ordinal[times]
-        return messages.blocks(ordinal)
+        valid = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
+        if not valid.all():
+            self._note("time-invalid", messages_lost=int((~valid).sum()))
+            messages, ordinal = messages.at(valid), ordinal[valid]
+        times = messages.log_time_ns, messages.publish_time_ns
+        return split_by_channel(messages.data, messages.channel, messages.payload, messages.length, *times, ordinal)
 
     def _note_index_disagreement(self, chunk: AnyChunk, messages: Messages, entries: Entries | None) -> None:
         """Record that a chunk's index is damaged, or differs from its records."""

@@ -73,6 +73,11 @@ def group_by_key(keys: Ints) -> Iterator[tuple[int, Ints]]:
         yield int(keys[order[start]]), order[start:end]
 
 
+def split_by_channel(buffer: memoryview, channel: Ints, *columns: Ints) -> list[MessageBlock]:
+    """Return messages in one buffer as one block a channel; the other columns are those of a block, in its order."""
+    return [MessageBlock(number, buffer, *(values[at] for values in columns)) for number, at in group_by_key(channel)]
+
+
 class LogPart(ABC):
     """One file of a log, open for reading."""
 

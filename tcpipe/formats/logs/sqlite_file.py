@@ -17,7 +17,7 @@ import numpy as np
 
 from tcpipe.errors import LogError
 from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
-from tcpipe.formats.logs.log_part import MAX_CHANNELS, Bounds, LogPart, MessageBlock, group_by_key
+from tcpipe.formats.logs.log_part import MAX_CHANNELS, Bounds, LogPart, MessageBlock, split_by_channel
 from tcpipe.logs.topics import Topic, normalize_type_name
 
 MAGIC = b"SQLite format 3\0"
@@ -266,12 +266,10 @@ def _describe_error(error: Exception) -> str:
     return str(error) or "a row claims more than memory holds"
 
 
-def _read_blocks(rows: list[_Row]) -> Iterator[MessageBlock]:
-    """Yield rows as one block a topic."""
+def _read_blocks(rows: list[_Row]) -> list[MessageBlock]:
+    """Return rows as one block a topic."""
     numbers, channels, log_ns, publish_ns, payloads = zip(*rows, strict=True)
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
-    offsets = np.cumsum(lengths) - lengths
-    buffer = memoryview(b"".join(payloads))
-    ordinal, channel, log, publish = np.array([numbers, channels, log_ns, publish_ns], np.int64)
-    for topic, at in group_by_key(channel):
-        yield MessageBlock(topic, buffer, offsets[at], lengths[at], log[at], publish[at], ordinal[at])
+    ordinal, channel, *times = np.array([numbers, channels, log_ns, publish_ns], np.int64)
+    buffer, offsets = memoryview(b"".join(payloads)), np.cumsum(lengths) - lengths
+    return split_by_channel(buffer, channel, offsets, lengths, *times, ordinal)
