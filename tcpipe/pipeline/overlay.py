@@ -19,6 +19,7 @@ from tcpipe.arrays import AnyArray, Ints, Texts
 from tcpipe.errors import LogError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import Location
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.message_tables import make_stamp_fields
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.stored_runs import StoredRun
@@ -107,7 +108,7 @@ def _iterate_streams(run: StoredRun) -> Iterator[MessageStream]:
             yield MessageStream(
                 f"{OVERLAY}segments", GEOJSON, times[:1], {}, {"geojson": geojson}, definition="string geojson\n"
             )
-    columns = _make_header(_read_column(rows, "stamp_ns"))
+    columns: dict[str, AnyArray] = {**make_stamp_fields(_read_column(rows, "stamp_ns"))}
     columns |= {f"pose.position.{axis}": _read_column(rows, f"{axis}_m") for axis in "xyz"}
     quat = quat_from_rpy(*(_read_column(rows, f"{name}_rad") for name in ("roll", "pitch", "yaw")))
     columns |= {f"pose.orientation.{axis}": quat[:, at] for at, axis in enumerate("xyzw")}
@@ -169,13 +170,9 @@ def _add_bit_names(table: pa.Table, column: str, flags: type[DropReason | Qualit
     return table.append_column(name, make_text_column([texts[int(value)] for value in bits]))
 
 
-def _make_header(stamp_ns: Ints) -> dict[str, AnyArray]:
-    return {"header.stamp.sec": stamp_ns // 10**9, "header.stamp.nanosec": stamp_ns % 10**9}
-
-
 def _make_fixes(rows: pa.Table, times: Ints) -> MessageStream:
     """Return the track as NavSatFix, in the datum of the log's own fixes, its variances beside."""
-    columns = _make_header(_read_column(rows, "stamp_ns"))
+    columns = make_stamp_fields(_read_column(rows, "stamp_ns"))
     columns |= {
         name: _read_column(rows, f"{name[:3]}_{unit}")
         for name, unit in (("longitude", "deg"), ("latitude", "deg"), ("altitude", "m"))
@@ -198,7 +195,7 @@ def _iterate_messages(name: str, stamp: str, table: pa.Table, times: Ints) -> It
     """Yield rows of a table as messages of an own type: a field per column, null as NaN, by lengths of texts."""
     kinds = {field.name: _ROS_TYPES[field.type] for field in table.schema}
     definition = "std_msgs/Header header\n" + "".join(f"{kind} {column_name}\n" for column_name, kind in kinds.items())
-    columns = _make_header(_read_column(table, stamp))
+    columns: dict[str, AnyArray] = {**make_stamp_fields(_read_column(table, stamp))}
     lengths = np.zeros((len(times), 0), np.int64)
     for column_name, kind in kinds.items():
         if kind == "string":

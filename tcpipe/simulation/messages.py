@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from tcpipe.arrays import Floats
+from tcpipe.formats.logs.message_tables import make_stamp_fields
 from tcpipe.formats.logs.writing import MessageStream
 from tcpipe.simulation.sensors import (
     Doppler,
@@ -70,10 +71,8 @@ def make_streams(readings: Mapping[str, Reading], sensors: Sensors, recorder: Re
 def _make_stream(
     topic: str, type_name: str, reading: Reading, frame: str, columns: Values, **constants: Any
 ) -> MessageStream:
-    sec, nanosec = np.divmod(reading.stamp_ns, 1_000_000_000)
-    header = {"header.seq": np.arange(sec.size), "header.stamp.sec": sec, "header.stamp.nanosec": nanosec}
     fixed = {"header.frame_id": frame, **{name.replace("__", "."): value for name, value in constants.items()}}
-    columns = {**header, **columns}
+    columns = {"header.seq": np.arange(reading.stamp_ns.size), **make_stamp_fields(reading.stamp_ns), **columns}
     return MessageStream(topic, type_name, reading.log_time_ns, columns, fixed, publish_time_ns=reading.stamp_ns)
 
 
