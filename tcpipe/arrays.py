@@ -35,3 +35,10 @@ def count_before(mask: Mask) -> Ints:
 def number_within(counts: Ints) -> Ints:
     """Return the numbers 0, 1, … inside each of several groups that follow one another, shape (sum of counts,)."""
     return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def gather_values(buffer: bytes | memoryview | Bytes, offsets: Ints, dtype: np.dtype[np.generic]) -> AnyArray:
+    """Return the values of a type at bytes of a buffer, of any alignment; the caller has checked the bounds."""
+    count = max(len(buffer) - dtype.itemsize + 1, 0)
+    windows: AnyArray = np.ndarray((count,), f"V{dtype.itemsize}", buffer if count else b"", 0, (1,))
+    return windows[offsets].view(dtype)

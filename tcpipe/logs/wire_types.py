@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, GenericArray, Ints, Mask, number_within
+from tcpipe.arrays import Bytes, GenericArray, Ints, Mask, gather_values, number_within
 from tcpipe.logs.topics import normalize_type_name
 
 MAX_COLUMNS = 20_000
@@ -293,9 +292,6 @@ class _Cursors:
         self._data, self._bases, self._sizes, self._dialect = data, bases, sizes, dialect
         self._at = 0
         self._positions, self._good = np.zeros(len(sizes), np.int64), sizes >= 0
-        self._counts: NDArray[np.void] = np.ndarray(
-            (max(len(data) - 3, 0),), "V4", data if len(data) > 3 else b"", 0, (1,)
-        )
 
     def find_finished(self) -> Mask:
         """Return which messages fit, and have no more bytes left than may follow the last field."""
@@ -386,7 +382,7 @@ class _Cursors:
             return counts
         good = self._good[rows]
         found = np.zeros(len(rows), np.int64)
-        found[good] = self._counts[places[good]].view(dtype)
+        found[good] = gather_values(self._data, places[good], dtype)
         return found
 
     def take(self, rows: Ints, sizes: int | Ints, alignment: int | Ints) -> Places:

@@ -8,9 +8,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Bytes, Ints, Mask
+from tcpipe.arrays import Bytes, Ints, Mask, gather_values
 from tcpipe.formats.logs.log_part import MessageBlock, gather_integers
 from tcpipe.formats.logs.ros_types import MessageType
 from tcpipe.logs.wire_types import (
@@ -197,8 +196,7 @@ def _gather_payloads(buffer: memoryview, offsets: _Int64, length: int) -> Bytes:
     """Return messages of one length one after the other."""
     if not length:
         return np.zeros(0, np.uint8)
-    windows: NDArray[np.void] = np.ndarray((len(buffer) - length + 1,), f"V{length}", buffer, 0, (1,))
-    return windows[offsets].view(np.uint8)
+    return gather_values(buffer, offsets, np.dtype(f"V{length}")).view(np.uint8)
 
 
 def find_arrow_type(wire_type: WireType) -> pa.DataType:
@@ -272,11 +270,7 @@ class WalkedColumns:
             case Scalars(places=Grid() as grid, dtype=dtype), Scalar():
                 return number_column(grid.view(self._data, dtype))
             case Scalars(places=np.ndarray() as offsets, dtype=dtype), Scalar():
-                shape = (max(len(self._data) - dtype.itemsize + 1, 0),)
-                windows: NDArray[np.void] = np.ndarray(
-                    shape, f"V{dtype.itemsize}", self._data if shape[0] else b"", 0, (1,)
-                )
-                return number_column(windows[offsets].view(dtype))
+                return number_column(gather_values(self._data, offsets, dtype))
         raise TypeError(f"{type(values).__name__} are no values of {wire_type}")
 
     def _compact(self, runs: Runs) -> tuple[pa.Buffer, pa.Buffer]:

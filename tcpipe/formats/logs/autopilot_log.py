@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
-from tcpipe.arrays import AnyArray, Ints, Mask
+from tcpipe.arrays import AnyArray, Ints, Mask, gather_values
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import MAX_COLUMNS, MAX_TOPICS
 from tcpipe.formats.logs.log_part import gather_integers
@@ -62,9 +62,7 @@ class AutopilotMessages:
 
     def read_columns(self, data: bytes) -> dict[str, AnyArray]:
         """Return the fields by name, shape (N,) or (N, k)."""
-        size = self.layout.itemsize
-        packed: NDArray[np.void] = np.ndarray((len(data) - size + 1,), f"V{size}", data, 0, (1,))
-        rows = packed[self.offsets].view(self.layout)
+        rows = gather_values(data, self.offsets, self.layout)
         return {
             name: rows[name] * self.scales[name] if name in self.scales else rows[name]
             for name in self.layout.names or ()

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.arrays import GenericArray, Ints
+from tcpipe.arrays import Ints, gather_values
 from tcpipe.errors import LogError
 from tcpipe.formats.object_storage import StoredObject
 from tcpipe.logs.topics import Damage, Topic
@@ -358,6 +358,4 @@ def gather_integers(buffer: bytes | memoryview, offsets: Ints, code: str) -> Int
     The caller has checked the bounds. Unsigned 64-bit values are read as ``i8``: no length or time in a log reaches the
     sign bit, and one that claims to is negative, which every check refuses.
     """
-    kind = np.dtype("<" + code)
-    windows: GenericArray = np.ndarray((len(buffer) - kind.itemsize + 1,), kind, buffer, 0, (1,))
-    return windows[offsets].astype(np.int64)
+    return gather_values(buffer, offsets, np.dtype("<" + code)).astype(np.int64)

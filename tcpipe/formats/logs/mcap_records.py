@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from isal.isal_zlib import crc32
-from numpy.typing import NDArray
 
-from tcpipe.arrays import Ints, Mask, number_within
+from tcpipe.arrays import Ints, Mask, gather_values, number_within
 from tcpipe.formats.logs.chunk_reading import Messages
 from tcpipe.formats.logs.log_part import ByteSource, DamageError, gather_integers, outline_of
 
@@ -214,9 +213,7 @@ def index_messages(data: bytes, records: Ints, ends: Ints, channels: Ints) -> tu
 
 def read_messages_at(data: memoryview, offsets: Ints) -> tuple[Messages, Mask]:
     """Return the messages at ``offsets`` within the data, and which of them are messages by opcode and length."""
-    count = max(len(data) - _MESSAGE.itemsize + 1, 0)
-    windows: NDArray[np.void] = np.ndarray((count,), f"V{_MESSAGE.itemsize}", data if count else b"", 0, (1,))
-    heads = windows[offsets].view(_MESSAGE)
+    heads = gather_values(data, offsets, _MESSAGE)
     messages = Messages(
         data,
         heads["channel"].astype(np.int64),
