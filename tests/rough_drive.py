@@ -16,7 +16,7 @@ from tcpipe.fusion.measurements import (
     Trajectory,
 )
 from tcpipe.geometry.rotation import quat_from_matrix, quat_from_rpy, rpy_from_matrix
-from tcpipe.tables.facts import StretchFacts
+from tcpipe.tables.facts import SectionFacts
 
 RATE_HZ = 200
 ANTENNA_M = (0.2, -0.1, 0.8)
@@ -134,5 +134,5 @@ def true_track(truth):
         forward_velocity_std_mps=np.full(rows.size, 0.01),
         rejections={},
         displacement_std_m=np.full((rows.size, 1), 0.01) * DISPLACEMENT_LAGS_S,
-        facts=StretchFacts({}, {}, {}),
+        facts=SectionFacts({}, {}, {}),
     )

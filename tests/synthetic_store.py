@@ -24,7 +24,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import make_lines
-from tcpipe.tables.facts import FuseFacts, PowerSign, StageFacts, StretchFacts
+from tcpipe.tables.facts import FuseFacts, PowerSign, SectionFacts, StageFacts
 from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -263,7 +263,7 @@ def make_fixes(stamp_ns, *, drive=0, late_ns=0, topic="/fix"):
 
 def make_fuse_facts():
     """Return facts of a run of two sections."""
-    sections = (StretchFacts({}, {}, {}, end_ns=1), StretchFacts({}, {}, {}, end_ns=10**10))
+    sections = (SectionFacts({}, {}, {}, end_ns=1), SectionFacts({}, {}, {}, end_ns=10**10))
     return StageFacts(fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, sections))
 
 

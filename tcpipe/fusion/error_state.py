@@ -63,7 +63,7 @@ from tcpipe.fusion.state import Error, Kind
 from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
 from tcpipe.robust import MIN_SIGMAS
-from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts
+from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, SectionFacts
 from tcpipe.tables.findings import Subject, make_finding, read_threshold
 
 _UNCHANGED = Hypothesis(())
@@ -479,7 +479,7 @@ def _list_changes(forward: Pass, smoothed: Smoothed, explained: Hypothesis) -> I
 
 def _make_facts(  # noqa: PLR0917
     m: Measurements, forward: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Hypothesis
-) -> StretchFacts:
+) -> SectionFacts:
     rows = _list_rows(m, forward)
     tests = forward.tests
     nis, verdicts = {}, {}
@@ -488,7 +488,7 @@ def _make_facts(  # noqa: PLR0917
         taken = np.concatenate([tests.nis[tests.verdict[:, kind] == GateVerdict.ACCEPTED, kind] for kind in kinds])
         nis[role] = float(taken.mean()) / state.SIZES[kinds[0]] if taken.size else None
         verdicts[role] = np.concatenate([tests.verdict[rows[kind][1], kind] for kind in kinds])
-    return StretchFacts(
+    return SectionFacts(
         nis_mean=nis,
         measurements={role: int(verdict.size) for role, verdict in verdicts.items()},
         rejected={role: int((verdict == GateVerdict.REJECTED).sum()) for role, verdict in verdicts.items()},

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tcpipe.arrays import Floats, Ints, Mask
 from tcpipe.fusion.signals import compute_median_period_ns, is_in_gap
-from tcpipe.tables.facts import StretchFacts
+from tcpipe.tables.facts import SectionFacts
 
 GNSS, IMU, WHEELS, VISUAL, DOPPLER = "gnss", "imu", "wheel_odometry", "visual_odometry", "gnss_velocity"
 """Roles, as in the rejections table."""
@@ -303,7 +303,7 @@ class Trajectory:
     forward_velocity_std_mps: Floats
     rejections: Mapping[str, NDArray[Any]]
     displacement_std_m: Floats
-    facts: StretchFacts
+    facts: SectionFacts
 
 
 PAUSE_NS = 5_000_000_000

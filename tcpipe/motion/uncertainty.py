@@ -111,7 +111,7 @@ def compute_chord_ahead_std_m(
 def find_common_scale_std(facts: FuseFacts | None, stamp_ns: Ints, clock_epoch: Ints) -> Floats:
     """Return σ of the unobservable scale of distances at each time, shape (N,): one common error of its section."""
     std = np.zeros(len(stamp_ns))
-    for section in facts.stretches if facts else ():
+    for section in facts.sections if facts else ():
         inside = (clock_epoch == section.clock_epoch) & (stamp_ns >= section.start_ns) & (stamp_ns <= section.end_ns)
         std[inside] = section.common_scale_std or 0.0
     return std

@@ -35,8 +35,8 @@ def exclude_other_clocks(sections: Sequence[Section], streams: Streams) -> list[
     for place in rank_sections(sections):
         section = sections[place]
         offsets = find_other_clocks(section.measurements)
-        reference = next((role for role, offset in offsets.items() if not offset.noted), "")
-        known |= {role: (reference, offset) for role, offset in offsets.items() if offset.noted}
+        reference = next((role for role, offset in offsets.items() if not offset.is_significant), "")
+        known |= {role: (reference, offset) for role, offset in offsets.items() if offset.is_significant}
         for role in [role for role in known if role in section.measurements.sensors()]:
             against, offset = known[role]
             numbers = {"offset_s": offset.offset_s, "offset_2std_s": 2 * offset.std_s}
@@ -71,12 +71,16 @@ def find_clocks(sections: Sequence[Section]) -> list[Section]:
         m = sections[index].measurements
         clocks = find_clock_offsets(m, clock_epoch=sections[index].clock_epoch)
         middle_ns = sum(sections[index].span_ns) // 2
-        own = {role: (offset, clocks.reference, middle_ns) for role, offset in clocks.offsets.items() if offset.noted}
+        own = {
+            role: (offset, clocks.reference, middle_ns)
+            for role, offset in clocks.offsets.items()
+            if offset.is_significant
+        }
         for role in sorted(best_offsets.keys() & m.sensors().keys() - clocks.offsets.keys() - {clocks.reference}):
             offset, reference, at_ns = best_offsets[role]
             if offset.drift_ppm:
                 drift_s = offset.drift_ppm * 1e-6 * (middle_ns - at_ns) * 1e-9
-                offset = ClockOffset(0.0, float(np.hypot(offset.std_s, drift_s)), noted=True, blamed=False)
+                offset = ClockOffset(0.0, float(np.hypot(offset.std_s, drift_s)), is_significant=True, is_wrong=False)
             clocks = replace(clocks, reference=clocks.reference or reference, offsets={**clocks.offsets, role: offset})
         best_offsets = own | best_offsets
         found[index] = replace(sections[index], clocks=clocks)
@@ -113,7 +117,7 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
     compared = dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against})
     names, drift_s = {"reference": found.reference, "by": ", ".join(compared)}, 1e-6 * offset.drift_ppm * span_s
     numbers: dict[str, Any] = {"offset_s": offset.offset_s, "offset_2std_s": 2 * offset.std_s}
-    if not offset.blamed:
+    if not offset.is_wrong:
         return make_finding("clocks-differ", Subject("role", role), names=names, drift_s=drift_s, **numbers)
     code, remedies = "time-offset", _state_offset(role, offset, streams)
     if offset.drift_ppm:

@@ -21,13 +21,13 @@ from tcpipe.geometry.rotation import (
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robust import MIN_SIGMAS
 from tcpipe.stages.fuse_inputs import Section, exclude_role, state_extrinsics
-from tcpipe.tables.facts import ChangeFacts, FuseFacts, GateReset, ParameterFacts, StretchFacts
+from tcpipe.tables.facts import ChangeFacts, FuseFacts, GateReset, ParameterFacts, SectionFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
 
 
 def make_fuse_facts(
-    inputs: Sequence[Section], sections: Sequence[StretchFacts], *, rows: int, skipped_s: float
+    inputs: Sequence[Section], sections: Sequence[SectionFacts], *, rows: int, skipped_s: float
 ) -> FuseFacts:
     """Return the facts of the run: counts by role over all sections, excluded measurements, and each section."""
     roles = sorted({role for section in sections for role in section.measurements})
@@ -46,7 +46,7 @@ def make_fuse_facts(
         nis_mean=nis,
         set_aside=add_counts(inputs),
         skipped_s=skipped_s,
-        stretches=tuple(sections),
+        sections=tuple(sections),
     )
 
 
@@ -65,7 +65,7 @@ def add_counts(inputs: Sequence[Section]) -> dict[str, dict[str, int]]:
 
 def find_fuse_findings(inputs: Sequence[Section], facts: FuseFacts, *, run: Subject) -> tuple[Finding, ...]:
     """Return the findings of fusion."""
-    first_ns = min((section.start_ns for section in facts.stretches), default=0)
+    first_ns = min((section.start_ns for section in facts.sections), default=0)
     unused = set.intersection(*(set(section.excluded) for section in inputs))
     all_findings = (finding for section in inputs for finding in section.findings)
     findings = [*dict.fromkeys(finding for finding in all_findings if finding.subject.name not in unused)]
@@ -88,7 +88,7 @@ def find_fuse_findings(inputs: Sequence[Section], facts: FuseFacts, *, run: Subj
 
 def _find_gate_resets(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
     """Yield the finding that fixes contradicted the odometry for seconds: number of times, and the largest one."""
-    gate_resets = [gate_reset for section in facts.stretches for gate_reset in section.gate_resets]
+    gate_resets = [gate_reset for section in facts.sections for gate_reset in section.gate_resets]
     odometries = [role for role in (WHEELS, VISUAL) if role in facts.sensors]
     if gate_resets:
         worst = max(gate_resets, key=lambda gate_reset: gate_reset.size)
@@ -99,11 +99,11 @@ def _find_gate_resets(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
 
 def _find_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Finding]:
     """Yield a finding for each change that explains a contradiction, and for each section with many changes."""
-    changes = (each for section in facts.stretches for each in section.changes if each.kind in CHANGES)
+    changes = (each for section in facts.sections for each in section.changes if each.kind in CHANGES)
     for change in sorted(changes, key=lambda each: each.start_ns):
         names, span_s = {"change": CHANGES[change.kind].format(change.size)}, _find_span_s(change, first_ns)
         yield make_finding("sensor-changed", Subject("role", change.role), span_s=span_s, names=names)
-    for section in facts.stretches:
+    for section in facts.sections:
         count = section.count_changes()
         if count > read_threshold("changes-unlikely", "max_change_count"):
             yield make_finding("changes-unlikely", run, span_s=_find_span_s(section, first_ns), change_count=count)
@@ -111,7 +111,7 @@ def _find_changes(facts: FuseFacts, first_ns: int, run: Subject) -> Iterator[Fin
 
 def _find_weak_sensors(facts: FuseFacts) -> Iterator[Finding]:
     """Yield findings on odometries with an uncertain scale, and on sensors with many rejected measurements."""
-    std = max((section.common_scale_std or 0.0 for section in facts.stretches), default=0.0)
+    std = max((section.common_scale_std or 0.0 for section in facts.sections), default=0.0)
     if std > read_threshold("odometry-scale-unobservable", "min_scale_std_fraction"):
         role = WHEELS if WHEELS in facts.sensors or VISUAL not in facts.sensors else VISUAL
         names = {"reason": "coarse-gnss" if GNSS in facts.sensors else "no-gnss"}
@@ -148,7 +148,7 @@ CHANGES = {
 """Sentences for changes, with their size."""
 
 
-def _find_span_s(each: StretchFacts | GateReset | ChangeFacts, first_ns: int) -> tuple[float, float]:
+def _find_span_s(each: SectionFacts | GateReset | ChangeFacts, first_ns: int) -> tuple[float, float]:
     """Return start and end since the first stamp [s]; the first tick may be before that stamp."""
     return max(each.start_ns - first_ns, 0) / 1e9, (each.end_ns - first_ns) / 1e9
 
@@ -184,7 +184,7 @@ def find_parameter_findings(inputs: Sequence[Section], facts: FuseFacts, streams
     # The scale of wheels always varies, since they slip.
     camera = parameters.get("camera scale")
     varies = {} if camera is None else {VISUAL: max(camera.variation, default=0.0)}
-    varies |= {each.role: each.size for section in facts.stretches for each in section.changes if each.kind == "varies"}
+    varies |= {each.role: each.size for section in facts.sections for each in section.changes if each.kind == "varies"}
     for role, variation in varies.items():
         if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
             yield make_finding("odometry-scale-varies", Subject("role", role), variation_fraction=variation)
@@ -196,7 +196,7 @@ def _is_contradicted(found: ParameterFacts, least: float) -> bool:
 
 
 def _find_rotation(
-    turned: ParameterFacts | None, inputs: Sequence[Section], part: StretchFacts, sensor: Sensor
+    turned: ParameterFacts | None, inputs: Sequence[Section], part: SectionFacts, sensor: Sensor
 ) -> Floats:
     """Return the rotation of the positions' sensor to base_link, (3, 3); for a pose as estimated from its run."""
     of_epoch = (each.measurements.gnss for each in inputs if each.clock_epoch == part.clock_epoch)

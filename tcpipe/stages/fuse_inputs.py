@@ -75,7 +75,9 @@ class Section:
     def offsets(self) -> dict[str, ClockOffset]:
         """Time offsets that are corrected, by role."""
         sensors = self.measurements.sensors()
-        return {role: offset for role, offset in self.clocks.offsets.items() if offset.noted and role in sensors}
+        return {
+            role: offset for role, offset in self.clocks.offsets.items() if offset.is_significant and role in sensors
+        }
 
     @property
     def driven_m(self) -> float:

@@ -31,7 +31,7 @@ from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import Section, rank_sections
 from tcpipe.stages.message_arrays import make_rails
-from tcpipe.tables.facts import StretchFacts
+from tcpipe.tables.facts import SectionFacts
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import REJECTIONS, Streams
 
@@ -41,7 +41,7 @@ class Fused:
     """Trajectories, facts and columns of all sections; time without track [s]."""
 
     found: list[Trajectory] = field(default_factory=list)
-    facts: list[StretchFacts] = field(default_factory=list)
+    facts: list[SectionFacts] = field(default_factory=list)
     columns: list[Mapping[str, Signal]] = field(default_factory=list)
     skipped_s: float = 0.0
 
@@ -167,7 +167,7 @@ def make_rejections_table(sections: Sequence[Section], found: Sequence[Trajector
     return REJECTIONS.table(**{name: values[order] for name, values in joined.items()})
 
 
-def make_section_facts(section: TrackSection, initial: InitialState, found: Trajectory) -> StretchFacts:
+def make_section_facts(section: TrackSection, initial: InitialState, found: Trajectory) -> SectionFacts:
     """Return the facts of one section: results of the filter, its time span and its start."""
     m = section.measurements
     return replace(

@@ -85,7 +85,7 @@ def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> Float
         return density
     rate_hz = 1e9 / compute_median_period_ns(np.unique(to_integers(imu, "stamp_ns")))
     epoch = int(to_integers(cut, "clock_epoch")[0])
-    for each in facts.stretches:
+    for each in facts.sections:
         if each.clock_epoch == epoch and IMU in each.sensors and each.gyro_noise_radps is not None:
             is_inside = (start_ns >= each.start_ns) & (start_ns <= each.end_ns)
             density[is_inside] = 1.5 * each.gyro_noise_radps**2 / rate_hz + PRIORS["imu turn"].variance
@@ -169,7 +169,7 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> Mask:
     (start_ns, end_ns), epoch = read_spans_ns(cut), to_integers(cut, "clock_epoch")
     facts = info.report.facts
     times: list[tuple[int, int, int]] = []
-    for section in facts.fuse.stretches if facts.fuse else ():
+    for section in facts.fuse.sections if facts.fuse else ():
         times += [(section.clock_epoch, r.start_ns, r.end_ns) for r in section.gate_resets]
         if not section.is_explained(*limits):
             times.append((section.clock_epoch, section.start_ns, section.end_ns))
@@ -202,7 +202,10 @@ def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     offsets = (offset for clocks in info.report.facts.clock_offsets for offset in clocks.offsets.values())
-    has_offset, checks = any(offset.noted and not offset.blamed for offset in offsets), info.report.facts.sensor_checks
+    has_offset, checks = (
+        any(offset.is_significant and not offset.is_wrong for offset in offsets),
+        info.report.facts.sensor_checks,
+    )
     has_far_clock = checks is not None and "clocks-differ" in checks.excluded.values()
     # A step of all clocks leaves them together.
     return recorder or has_offset or has_far_clock or any(step.topics for step in streams.report.facts.clock_steps)

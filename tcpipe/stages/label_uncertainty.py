@@ -269,7 +269,7 @@ def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts)
         confirms = np.searchsorted(stamp_ns, end_ns, side="right") > np.searchsorted(stamp_ns, start_ns, side="left")
         fused = [
             (section.start_ns, section.end_ns)
-            for section in (facts.fuse.stretches if facts.fuse else ())
+            for section in (facts.fuse.sections if facts.fuse else ())
             if section.clock_epoch == epoch and sensor in section.sensors
         ]
         touched = np.zeros(len(start_ns), dtype=bool)

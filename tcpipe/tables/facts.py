@@ -107,7 +107,7 @@ class ParameterFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class StretchFacts:
+class SectionFacts:
     """One section that was fused in one pass: counts and estimates of the filter, then its span and initial state.
 
     ``nis_mean`` is the normalised innovation squared over degrees of freedom, without rejected measurements.
@@ -151,12 +151,12 @@ class FuseFacts:
     nis_mean: Mapping[str, float | None]
     set_aside: Mapping[str, Mapping[str, int]]
     skipped_s: float
-    stretches: tuple[StretchFacts, ...]
+    sections: tuple[SectionFacts, ...]
 
     @property
-    def longest(self) -> StretchFacts:
+    def longest(self) -> SectionFacts:
         """The longest section."""
-        return max(self.stretches, key=lambda section: section.end_ns - section.start_ns)
+        return max(self.sections, key=lambda section: section.end_ns - section.start_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,14 +188,14 @@ class ClockPair:
 class ClockOffset:
     """Delay of a sensor's stamps against the reference in the middle of the run, and its drift; 0 if not certain.
 
-    ``noted``: whether a person should act on it; ``blamed``: the sensor is off, since two others agree against it;
-    otherwise it and the reference differ, and it is unknown which of them is off.
+    ``is_significant``: a person should act on it. ``is_wrong``: this clock is wrong, since two others agree with each
+    other and differ from it; if False, this clock and the reference differ, and it is unknown which is wrong.
     """
 
     offset_s: float
     std_s: float
-    noted: bool
-    blamed: bool = True
+    is_significant: bool
+    is_wrong: bool = True
     drift_ppm: float = 0.0
 
 
@@ -226,7 +226,7 @@ class SegmentFacts:
     """Counts of segments and of steady sections; length of the track, and its time by reason."""
 
     segments: int
-    stretches: int
+    sections: int
     odometer_m: float
     duration_by_reason_s: Mapping[str, float]
 

@@ -23,7 +23,7 @@ DATA_MODEL_VERSION = "4.0"
 
 TABLES_VERSION = "4.0"  # in which a table last changed
 
-RESULTS_VERSION = 8
+RESULTS_VERSION = 9
 """Raised when the same log and recipe give other values in a table: runs of an earlier one are ingested again."""
 
 

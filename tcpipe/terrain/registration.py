@@ -226,12 +226,12 @@ def _flatten(excess_m: Floats, xy_m: Floats) -> tuple[Floats, Floats, Ints]:
     path_m = np.cumsum(np.hypot(*np.diff(xy_m, axis=0, prepend=xy_m[:1]).T))
     count = max(_BLOCKS, round(float(path_m[-1]) / _DRIFT_M))
     place = np.minimum(path_m * count // path_m[-1], count - 1)
-    _, first, stretch, sizes = np.unique(place, return_index=True, return_inverse=True, return_counts=True)
-    flat_m, tilt = (each - (np.add.reduceat(each, first).T / sizes).T[stretch] for each in (excess_m, xy_m))
+    _, first, section, sizes = np.unique(place, return_index=True, return_inverse=True, return_counts=True)
+    flat_m, tilt = (each - (np.add.reduceat(each, first).T / sizes).T[section] for each in (excess_m, xy_m))
     # Blocks of sections near each other: errors of the map repeat where the track passes again.
     east_m, north_m = ((xy_m - tilt)[first] - xy_m.min(axis=0)).T
     rank = np.argsort(np.argsort(compute_morton(east_m.astype(np.int64), north_m.astype(np.int64)), kind="stable"))
-    return _remove_tilt(flat_m, tilt), tilt, (rank * min(_BLOCKS, len(sizes)) // len(sizes))[stretch]
+    return _remove_tilt(flat_m, tilt), tilt, (rank * min(_BLOCKS, len(sizes)) // len(sizes))[section]
 
 
 def _remove_tilt(values: Floats, tilt: Floats) -> Floats:

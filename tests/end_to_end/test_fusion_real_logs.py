@@ -63,4 +63,4 @@ def test_husky_with_an_imu_mounted_on_its_side_and_sbas():
     assert np.abs(to_floats(table, "pitch_rad")).max() < 0.15
     moving = to_floats(table, "wheel_velocity_mps") > 0.5
     assert np.median(to_floats(table, "forward_velocity_mps")[moving]) == pytest.approx(0.98, abs=0.1)
-    assert track.info.report.facts.fuse.stretches[0].heading_from == "course over ground"
+    assert track.info.report.facts.fuse.sections[0].heading_from == "course over ground"

@@ -53,7 +53,7 @@ def test_straight_metres_behind_a_bend_are_recovered():
     assert cut.start_ns[5] in path.stamp_ns
 
 
-def test_the_three_kinds_tile_the_stretch():
+def test_the_three_kinds_tile_the_section():
     rng = np.random.default_rng(5)
     course = np.cumsum(np.repeat(rng.normal(0, 1.2, 60), 500)) * 0.001
     path = drive(course)
@@ -68,7 +68,7 @@ def test_the_three_kinds_tile_the_stretch():
     assert sum(length for length, _ in cut.ledger(path).values()) == pytest.approx(path.length_m[-1], rel=1e-12)
 
 
-def test_a_stretch_shorter_than_a_chord_is_leftover():
+def test_a_section_shorter_than_a_chord_is_leftover():
     path = drive(np.zeros(1_001))
     cut = cut_by_chord(path, chord_m=1.0, max_arc_to_chord=1.02)
     assert len(cut.start_ns) == 0

@@ -76,14 +76,14 @@ def find_clock_offsets(m: Measurements, *, clock_epoch: int = 0) -> ClockFacts:
 def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, ClockOffset]:
     """Return, by role, the time offset of each sensor from the largest group of sensors that share a clock.
 
-    Offsets beyond the range of the fine search are marked as ``noted``. Without any the result is {}, unless
+    Offsets beyond the range of the fine search are marked as ``is_significant``. Without any the result is {}, unless
     ``always``. Sensors with an unknown offset are left out.
     """
     coarse = find_coarse_offsets(m)
-    if not always and not any(offset.noted for offset in coarse.values()):
+    if not always and not any(offset.is_significant for offset in coarse.values()):
         return {}
     solution = find_clock_offsets(shift_sensors(m, coarse, 0))
-    fine = {solution.reference: ClockOffset(0.0, 0.0, noted=False)} | dict(solution.offsets)
+    fine = {solution.reference: ClockOffset(0.0, 0.0, is_significant=False)} | dict(solution.offsets)
     zero = next((fine[role] for role, each in coarse.items() if each.offset_s == 0.0 and role in fine), None)
     if zero is not None:
         for role in coarse.keys() & fine.keys():
@@ -95,17 +95,17 @@ def find_other_clocks(m: Measurements, *, always: bool = False) -> dict[str, Clo
 def find_coarse_offsets(m: Measurements) -> dict[str, ClockOffset]:
     """Return approximate delays of sensors' stamps against the largest group that shares a clock; its reference has 0.
 
-    Offsets beyond the range of the fine search are marked as ``noted``. Returns {} if the pairs of sensors contradict
+    Offsets beyond the range of the fine search are marked as ``is_significant``. Returns {} if the pairs of sensors contradict
     each other.
     """
     pairs = [*_compare_roughly(m)]
     # The IMU comes last: it alone determines no track.
     solution = solve_offsets(pairs, near_s=NEAR_S, roles=(*ROLES[1:], IMU))
-    offsets = {solution.reference: ClockOffset(0.0, _COARSE_STD_S, noted=False)} | dict(solution.offsets)
+    offsets = {solution.reference: ClockOffset(0.0, _COARSE_STD_S, is_significant=False)} | dict(solution.offsets)
     if any(abs(_compute_misfit_s(pair, offsets)) > NEAR_S for pair in pairs if pair.late in offsets):
         return {}
     return {
-        role: ClockOffset(each.offset_s, _COARSE_STD_S, noted=abs(each.offset_s) > NEAR_S, blamed=False)
+        role: ClockOffset(each.offset_s, _COARSE_STD_S, is_significant=abs(each.offset_s) > NEAR_S, is_wrong=False)
         for role, each in offsets.items()
         if role
     }
@@ -219,12 +219,12 @@ def solve_offsets(
         for role, offsets in solved.items()
     }
     reference = max(solved, key=lambda role: len(agreeing[role]))  # on a tie, the first
-    offsets = {reference: ClockOffset(0.0, 0.0, noted=False)} | solved[reference]
+    offsets = {reference: ClockOffset(0.0, 0.0, is_significant=False)} | solved[reference]
     # A clock is wrong only if two other sensors agree, differ from it, and no pair contradicts.
     misfits = ((_compute_misfit_s(pair, offsets), pair.std_s) for pair in known if pair.late in offsets)
     is_sure = len(agreeing[reference]) > 1 and not any(_is_significant(*misfit) for misfit in misfits)
     decided = {
-        role: replace(offset, blamed=is_sure and role not in agreeing[reference])
+        role: replace(offset, is_wrong=is_sure and role not in agreeing[reference])
         for role, offset in solved[reference].items()
     }
     return ClockFacts(clock_epoch, reference, tuple(pairs), decided)
@@ -249,8 +249,8 @@ def _fit_offsets(reference: str, pairs: Sequence[ClockPair], span_s: float) -> d
         free, solution.reshape(2, -1).T.tolist(), stds.reshape(2, -1).T.tolist(), strict=True
     ):
         has_drift = _is_significant(rate * span_s, np.sqrt(birge) * rate_std * span_s)
-        noted = has_drift or _is_significant(offset_s, std_s)
-        offsets[role] = ClockOffset(offset_s, std_s, noted, drift_ppm=1e6 * rate if has_drift else 0.0)
+        is_significant = has_drift or _is_significant(offset_s, std_s)
+        offsets[role] = ClockOffset(offset_s, std_s, is_significant, drift_ppm=1e6 * rate if has_drift else 0.0)
     return offsets
 
 

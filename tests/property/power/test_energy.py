@@ -57,7 +57,7 @@ def test_energy_is_that_of_a_dense_sum(given_rails):
 
 @st.composite
 def records(draw):
-    """Return stamps, current, spans and standing stretches of a short, odd record, and whether it averages."""
+    """Return stamps, current, spans and standing sections of a short, odd record, and whether it averages."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     count, period_s = draw(st.sampled_from([2, 3, 5, 12, 60])), draw(st.sampled_from([0.001, 0.05, 0.3, 1.0, 10.0]))
     step_s = period_s * draw(st.sampled_from([rng.exponential(1, count), rng.uniform(0.9, 1.1, count)]))

@@ -1,4 +1,4 @@
-"""The start of a stretch against the truth of simulated drives."""
+"""The start of a section against the truth of simulated drives."""
 
 from dataclasses import replace
 

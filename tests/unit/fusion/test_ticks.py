@@ -260,17 +260,17 @@ def test_the_imu_bridges_a_pause_but_is_no_motion_by_itself():
 def test_stamps_are_multiples_of_the_period_and_gaps_are_left_out():
     zero = 1_700_000_000 * S
     stamps = zero + 17_000_000 + np.concatenate((grid(0, 2 * S, S // 50), grid(4 * S, 5 * S, S // 50)))
-    (stretch,) = cut_sections({0: Measurements(wheels=wheels(stamps))})
-    found = make_track_stamps(stretch, period_ns=50_000_000, max_gap_ns=S)
+    (section,) = cut_sections({0: Measurements(wheels=wheels(stamps))})
+    found = make_track_stamps(section, period_ns=50_000_000, max_gap_ns=S)
     assert (found % 50_000_000 == 0).all()
     assert found[0] == zero + 50_000_000
     assert found[-1] <= stamps[-1]
     step = np.diff(found)
     assert np.unique(step).tolist() == [50_000_000, 2_100_000_000]
     # A gap no longer than allowed stays.
-    assert (np.diff(make_track_stamps(stretch, period_ns=50_000_000, max_gap_ns=3 * S)) == 50_000_000).all()
+    assert (np.diff(make_track_stamps(section, period_ns=50_000_000, max_gap_ns=3 * S)) == 50_000_000).all()
 
 
 def test_a_slow_sensor_has_no_gaps_of_its_own_making():
-    (stretch,) = cut_sections({0: Measurements(gnss=fixes(grid(0, 60 * S, 2 * S)), imu=imu(grid(0, 60 * S, S // 50)))})
-    assert (np.diff(make_track_stamps(stretch, period_ns=50_000_000, max_gap_ns=S)) == 50_000_000).all()
+    (section,) = cut_sections({0: Measurements(gnss=fixes(grid(0, 60 * S, 2 * S)), imu=imu(grid(0, 60 * S, S // 50)))})
+    assert (np.diff(make_track_stamps(section, period_ns=50_000_000, max_gap_ns=S)) == 50_000_000).all()

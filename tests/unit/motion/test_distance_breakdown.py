@@ -21,7 +21,7 @@ from tcpipe.tables.findings import Subject, read_catalogue
 G, S, A = (int(bit) for bit in (DropReason.GAP, DropReason.STATIONARY, DropReason.ACCELERATING))
 
 
-def test_stretches_are_runs_of_two_kept_rows_inside_a_piece():
+def test_sections_are_runs_of_two_kept_rows_inside_a_piece():
     dropped = np.array([0, 0, S, 0, S, 0, 0, 0], dtype=np.uint32)
     piece = np.array([0, 0, 0, 0, 0, 0, 0, 1])
     assert find_kept_spans(dropped, piece).tolist() == [[0, 1], [5, 6]]

@@ -89,7 +89,7 @@ def test_what_is_not_known_of_the_lever_arm_is_no_part_of_the_antennas_sigma(str
     stated = replace(streams, sensors={**streams.sensors, "gnss": sensor((0.0, 0.0, 0.0))})
     report = track.info.report
     shown = {"antenna": ParameterFacts(drive.LEVER, (0.5,) * 3, (0.5,) * 3)}
-    fuse = replace(report.facts.fuse, stretches=[replace(of, parameters=shown) for of in report.facts.fuse.stretches])
+    fuse = replace(report.facts.fuse, sections=[replace(of, parameters=shown) for of in report.facts.fuse.sections])
     numbers = {f"{axis}{end}": 0.0 for axis in ("forward", "left", "up") for end in ("_m", "_std_m")}
     unknown = make_finding("lever-arm-unknown", Subject("role", "gnss"), names={"placed_by": "assumed"}, **numbers)
     report = replace(report, findings=(unknown,), facts=replace(report.facts, fuse=fuse))

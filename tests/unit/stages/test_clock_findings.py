@@ -53,16 +53,16 @@ def test_a_clean_drive_gives_no_warning(drive_log):
 @pytest.mark.parametrize("late", [("wheel_odometry",), ("imu",), ("gnss",)])
 def test_the_sensor_that_is_late_is_found_and_by_how_much(drive_log, late):
     found = doctor(drive_log(1, 42, *late))
-    noted = {name: offset for name, offset in found.facts.offsets.items() if offset.noted}
-    assert set(noted) == set(late)
+    significant = {name: offset for name, offset in found.facts.offsets.items() if offset.is_significant}
+    assert set(significant) == set(late)
     assert {finding.subject: finding.code for finding in found.findings} == {
         Subject("role", role): "time-offset" for role in late
     }
     for finding in found.findings:
         role = finding.subject.name
-        assert noted[role].offset_s == pytest.approx(LATE_S[role], abs=WITHIN_S[role])
+        assert significant[role].offset_s == pytest.approx(LATE_S[role], abs=WITHIN_S[role])
         assert finding.action == "corrected"
-        assert finding.numbers["offset_s"] == noted[role].offset_s
+        assert finding.numbers["offset_s"] == significant[role].offset_s
         said = proposed(finding)["read"]["time_offset_s"]
         assert said == {role: pytest.approx(-LATE_S[role], abs=WITHIN_S[role] + 0.005)}
 
@@ -86,7 +86,7 @@ def test_an_offset_is_taken_out_of_the_stamps_that_are_fused(drive_log):
     moved_s = (measured[1].wheels.stamp_ns - measured[0].wheels.stamp_ns) * 1e-9
     assert moved_s == pytest.approx(-LATE_S["wheel_odometry"], abs=WITHIN_S["wheel_odometry"])
     assert measured[1].imu is measured[0].imu
-    assert not any(offset.noted for offset in find_clocks(after)[0].clocks.offsets.values())
+    assert not any(offset.is_significant for offset in find_clocks(after)[0].clocks.offsets.values())
 
 
 def test_a_sensor_on_another_clock_is_excluded_until_the_recipe_states_the_offset(drive_log):

@@ -146,7 +146,7 @@ def test_findings_and_rejections(track):
     facts = track.info.report.facts.fuse
     assert facts.sensors == ("gnss", "imu", "visual_odometry", "wheel_odometry")
     assert facts.rows == track.table.num_rows
-    assert facts.stretches[0].heading_from == "course over ground"
+    assert facts.sections[0].heading_from == "course over ground"
     assert sum(facts.rejected.values()) == track.rejections.num_rows > 0
     assert set(track.rejections["reason"].to_pylist()) == {"gate"}
     assert track.info.estimator == "smoother"

@@ -9,7 +9,7 @@ from suggested_recipes import proposed
 
 from tcpipe.stages.fuse_findings import find_parameter_findings, make_fuse_facts
 from tcpipe.stages.fuse_inputs import Section
-from tcpipe.tables.facts import ChangeFacts, ParameterFacts, StretchFacts
+from tcpipe.tables.facts import ChangeFacts, ParameterFacts, SectionFacts
 from tcpipe.tables.levels import Sensor, Streams
 
 ARM_M = (0.1, 0.0, 0.9)
@@ -24,8 +24,8 @@ def streams(placed_by="tf_static"):
 def make_findings(log, changes=(), **parameters):
     """Return what is found of a run with sections that show nothing, and parameters, by name with spaces as underscores."""
     shown = {name.replace("_", " "): ParameterFacts(*of) for name, of in parameters.items()}
-    long = StretchFacts({}, {}, {}, start_ns=0, end_ns=100, parameters=shown)
-    sections = [StretchFacts({}, {}, {}, end_ns=9, changes=changes), long]
+    long = SectionFacts({}, {}, {}, start_ns=0, end_ns=100, parameters=shown)
+    sections = [SectionFacts({}, {}, {}, end_ns=9, changes=changes), long]
     facts = make_fuse_facts([Section(0)], sections, rows=0, skipped_s=0.0)
     return tuple(find_parameter_findings([Section(0)], facts, log))
 

@@ -22,8 +22,8 @@ from tcpipe.tables.facts import (
     FuseFacts,
     GateReset,
     MaskFacts,
+    SectionFacts,
     StageFacts,
-    StretchFacts,
 )
 from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import IMU, Sensor, Streams, TrackInfo
@@ -121,8 +121,8 @@ def test_a_hole_counts_by_the_rows_on_both_of_its_sides(late, near):
 
 def disagreement(start_ns, end_ns, *, clock_epoch=0):
     reset = GateReset(int(start_ns), int(end_ns), 1.0)
-    stretch = StretchFacts({}, {}, {}, clock_epoch=clock_epoch, gate_resets=(reset,))
-    return FuseFacts(200, ("gnss",), {}, {}, {}, {}, 0.0, (stretch,))
+    section = SectionFacts({}, {}, {}, clock_epoch=clock_epoch, gate_resets=(reset,))
+    return FuseFacts(200, ("gnss",), {}, {}, {}, {}, 0.0, (section,))
 
 
 @pytest.mark.parametrize(
@@ -147,8 +147,8 @@ def streams(*, steps=(), **time_sources):
     return Streams({}, sensors, "husky", report=StageReport((), StageFacts(epochs=len(steps) + 1, clock_steps=steps)))
 
 
-def clocks(role, *, noted=False, blamed=False):
-    offset = ClockOffset(0.1, 0.01, noted, blamed)
+def clocks(role, *, is_significant=False, is_wrong=False):
+    offset = ClockOffset(0.1, 0.01, is_significant, is_wrong)
     return info(clock_offsets=(ClockFacts(0, "gnss", (), {role: offset}),))
 
 
@@ -162,8 +162,8 @@ def test_a_clock_is_doubtful_that_steps_or_is_the_recorders():
 def test_a_clock_is_doubtful_that_is_off_unless_it_was_corrected():
     good = streams(gnss="header")
     assert not is_clock_doubtful(good, clocks("imu"))
-    assert is_clock_doubtful(good, clocks("imu", noted=True))
-    assert not is_clock_doubtful(good, clocks("imu", noted=True, blamed=True))
+    assert is_clock_doubtful(good, clocks("imu", is_significant=True))
+    assert not is_clock_doubtful(good, clocks("imu", is_significant=True, is_wrong=True))
 
 
 T = np.arange(0, 30, 0.05)

@@ -13,7 +13,7 @@ from tcpipe.stages.label import label_segments
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import FuseFacts, PowerSign, StretchFacts
+from tcpipe.tables.facts import FuseFacts, PowerSign, SectionFacts
 from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import GNSS, WHEEL_ODOMETRY
 
@@ -81,7 +81,7 @@ def test_the_recipe_states_a_better_sensor():
 
 def section(**values):
     ends = {"start_ns": ZERO, "end_ns": ZERO + 80_000_000_000}
-    fused = StretchFacts({}, {}, {}, **ends, **values)
+    fused = SectionFacts({}, {}, {}, **ends, **values)
     return {"fuse": FuseFacts(0, (), {}, {}, {}, {}, 0.0, (fused,))}
 
 

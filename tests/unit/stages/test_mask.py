@@ -11,7 +11,7 @@ from tcpipe.recipe import MaskConfig, SegmentConfig, TimeWindow
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.facts import FuseFacts, StretchFacts
+from tcpipe.tables.facts import FuseFacts, SectionFacts
 from tcpipe.tables.findings import StageReport, select_findings
 
 T = np.arange(0, 60, 0.05)
@@ -168,8 +168,8 @@ def test_an_error_of_scale_that_a_run_has_in_common_makes_no_gap():
     assert rows_of(gate(track), DropReason.GAP).all()
     stamp_ns = track.table["stamp_ns"].to_numpy()
     ends = {"start_ns": int(stamp_ns[0]), "end_ns": int(stamp_ns[-1])}
-    stretch = StretchFacts({}, {}, {}, common_scale_std=0.12, **ends)
-    facts = replace(track.info.report.facts, fuse=FuseFacts(200, (), {}, {}, {}, {}, 0.0, (stretch,)))
+    section = SectionFacts({}, {}, {}, common_scale_std=0.12, **ends)
+    facts = replace(track.info.report.facts, fuse=FuseFacts(200, (), {}, {}, {}, {}, 0.0, (section,)))
     known = gate(replace(track, info=replace(track.info, report=StageReport((), facts))))
     assert not rows_of(known, DropReason.GAP).any()
 

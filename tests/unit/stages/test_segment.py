@@ -57,7 +57,7 @@ def test_longitude_and_latitude_are_those_of_the_enu_position():
         assert np.max(apart) < 1e-6
 
 
-def test_kept_backward_stretches_never_share_a_segment_with_forward_ones():
+def test_kept_backward_sections_never_share_a_segment_with_forward_ones():
     speed = np.where(T < 30, 0.8, -0.8)
     track = straight_track(speed, forward_mps=speed)
     segments = cut(track, mask=MaskConfig(keep_reversing=True, max_acceleration_mps2=50.0, ramp_acceleration_mps2=50.0))

@@ -34,14 +34,17 @@ def test_the_one_that_differs_is_the_one_that_is_late():
     found = solve_offsets((pair("gnss", "wheel_odometry", 0.25), pair("wheel_odometry", "imu", 0.001)))
     assert found.reference == "imu"
     assert found.offsets["gnss"].offset_s == pytest.approx(0.251)
-    assert {role: offset.noted for role, offset in found.offsets.items()} == {"wheel_odometry": False, "gnss": True}
+    assert {role: offset.is_significant for role, offset in found.offsets.items()} == {
+        "wheel_odometry": False,
+        "gnss": True,
+    }
 
 
 def test_the_majority_rules_over_the_order():
     pairs = pair("wheel_odometry", "imu", 0.1), pair("visual_odometry", "imu", 0.1), pair("gnss", "wheel_odometry", 0.0)
     found = solve_offsets(pairs)
     assert found.reference == "wheel_odometry"
-    assert {role for role, offset in found.offsets.items() if offset.noted} == {"imu"}
+    assert {role for role, offset in found.offsets.items() if offset.is_significant} == {"imu"}
     assert found.offsets["imu"].offset_s == pytest.approx(-0.1)
 
 
@@ -54,7 +57,7 @@ def test_a_doubtful_clock_is_no_reference():
     )
     found = solve_offsets(pairs)
     assert found.reference == "wheel_odometry"
-    assert {role for role, offset in found.offsets.items() if offset.noted} == {"imu"}
+    assert {role for role, offset in found.offsets.items() if offset.is_significant} == {"imu"}
 
 
 def test_pairs_in_a_ring_are_weighed_by_their_variances():
@@ -87,12 +90,12 @@ def test_what_is_not_known_well_is_not_spoken_of(offset_s, std_s, explained, det
 
 
 def test_small_offsets_are_not_noted():
-    assert not solve_offsets((pair("gnss", "wheel_odometry", 0.045),)).offsets["gnss"].noted
-    assert solve_offsets((pair("gnss", "wheel_odometry", -0.055),)).offsets["gnss"].noted
+    assert not solve_offsets((pair("gnss", "wheel_odometry", 0.045),)).offsets["gnss"].is_significant
+    assert solve_offsets((pair("gnss", "wheel_odometry", -0.055),)).offsets["gnss"].is_significant
 
 
 def blamed(*pairs):
-    return {role for role, offset in solve_offsets(pairs).offsets.items() if offset.blamed}
+    return {role for role, offset in solve_offsets(pairs).offsets.items() if offset.is_wrong}
 
 
 def test_a_sensor_is_blamed_only_where_two_others_agree_against_it():
@@ -140,7 +143,7 @@ def test_a_clock_that_drifts_is_told_from_one_that_is_off():
     rate = 150e-6
     found = find_clock_offsets(drive_with_clocks(gnss=0.02 + rate * (HALF_HOUR - 950.0)))
     gnss = found.offsets["gnss"]
-    assert gnss.noted
+    assert gnss.is_significant
     assert gnss.drift_ppm == pytest.approx(1e6 * rate, rel=0.1)
     assert gnss.offset_s == pytest.approx(0.02, abs=0.01)
     assert found.offsets["wheel_odometry"].drift_ppm == 0.0
@@ -158,7 +161,7 @@ def test_a_drift_of_two_seconds_in_a_thousand_shows_within_three_minutes():
 def test_steady_clocks_do_not_drift_and_a_late_one_is_only_late():
     found = find_clock_offsets(drive_with_clocks(gnss=np.full(HALF_HOUR.size, 0.2)))
     assert not any(offset.drift_ppm for offset in found.offsets.values())
-    assert {role for role, offset in found.offsets.items() if offset.noted} == {"gnss"}
+    assert {role for role, offset in found.offsets.items() if offset.is_significant} == {"gnss"}
     assert found.offsets["gnss"].offset_s == pytest.approx(0.2, abs=0.01)
 
 
@@ -199,7 +202,7 @@ def test_the_mean_of_a_clock_that_steps_is_not_known():
 def test_stamps_without_offset_and_drift():
     """0.1 s in the middle of 100 s and 0.36 s an hour: 0.095 s at the beginning, 0.105 s at the end."""
     stamp_ns = np.array([0, 50, 100], np.int64) * 10**9
-    steady = ClockOffset(0.1, 0.01, noted=True)
+    steady = ClockOffset(0.1, 0.01, is_significant=True)
     assert (stamp_ns - shift_stamps(stamp_ns, steady, 50 * 10**9)).tolist() == [100_000_000] * 3
     drifting = replace(steady, drift_ppm=100.0)
     assert (stamp_ns - shift_stamps(stamp_ns, drifting, 50 * 10**9)).tolist() == [95_000_000, 100_000_000, 105_000_000]

@@ -61,7 +61,7 @@ def measure(speed, turn, *, seed=0, fix_std_m=0.02, without=(), **late_s):
 
 def find_far(m):
     """The coarse offsets of more than a second."""
-    return {role: each.offset_s for role, each in find_coarse_offsets(m).items() if each.noted}
+    return {role: each.offset_s for role, each in find_coarse_offsets(m).items() if each.is_significant}
 
 
 @pytest.mark.parametrize(("late_s", "std_m"), [(1.5, 0.02), (-3.7, 0.1), (18.0, 0.02), (-120.0, 0.1), (270.0, 0.02)])
@@ -69,7 +69,7 @@ def test_fixes_on_another_clock_are_found(late_s, std_m):
     drive = measure(*wander(1), gnss=late_s, fix_std_m=std_m)
     assert find_far(drive) == {"gnss": pytest.approx(late_s, abs=0.3)}
     found = find_other_clocks(drive)
-    assert {role for role, offset in found.items() if offset.noted} == {"gnss"}
+    assert {role for role, offset in found.items() if offset.is_significant} == {"gnss"}
     assert found["gnss"].offset_s == pytest.approx(late_s, abs=0.02)
 
 

@@ -60,7 +60,7 @@ def test_a_velocity_that_the_fixes_do_not_confirm_stays_out(truth, sensors, chan
 
 def test_a_late_receiver_is_corrected_with_its_velocity(truth, sensors):
     whole = with_velocity(sensors, truth)
-    shifted = shift_sensors(whole, {"gnss": ClockOffset(0.3, 0.01, noted=True)}, 0)
+    shifted = shift_sensors(whole, {"gnss": ClockOffset(0.3, 0.01, is_significant=True)}, 0)
     for name in ("gnss", "doppler"):
         assert (getattr(whole, name).stamp_ns - getattr(shifted, name).stamp_ns == 300_000_000).all()
 
