@@ -474,8 +474,8 @@ def _compare_with_truth(world: World, log: Log, track: Track, labelled: Labelled
     rows_s = log.find_true_s(to_integers(rows, "stamp_ns"))
     speed = np.hypot(to_floats(rows, "east_velocity_mps"), to_floats(rows, "north_velocity_mps"))
     true_speed = np.hypot(*world.at(rows_s, world.velocity_mps)[:, :2].T)
-    changes = sum(len(section.changes) for section in facts.fuse.stretches) + len(facts.sensor_checks.excluded)
-    changes += sum(offset.noted for clocks in facts.clock_offsets or () for offset in clocks.offsets.values())
+    changes = sum(len(section.changes) for section in facts.fuse.sections) + len(facts.sensor_checks.excluded)
+    changes += sum(offset.is_significant for clocks in facts.clock_offsets or () for offset in clocks.offsets.values())
     return Outcome(
         start_s.tolist(), {name: values.tolist() for name, values in error.items()},
         {name: to_floats(table, column).tolist() for name, (_, column, *_) in QUANTITIES.items()},
