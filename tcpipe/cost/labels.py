@@ -140,10 +140,8 @@ def subtract_idle_power(
     known = np.isfinite(energy_joule)
     common_joule = np.hypot(sensor.std_joule(energy_joule, of_net_energy=True), idle_std_watt * cost.duration_s)
     total_joule = np.hypot(energy_noise_joule, common_joule)
-    of_energy, of_power = (
-        end_power_watt - idle_watt,
-        end_power_watt - cost.power_watt,
-    )  # that an error of T is multiplied with
+    # An error of T is multiplied with these powers.
+    of_energy, of_power = end_power_watt - idle_watt, end_power_watt - cost.power_watt
     values: dict[str, Floats | float] = {
         "idle_power_watt": idle_watt,
         "idle_power_std_watt": idle_std_watt,

@@ -34,11 +34,11 @@ TEMPORARY_PREFIX = ".tmp-"
 _HOLDER = re.compile(re.escape(TEMPORARY_PREFIX) + r"(.+)-[0-9a-f]{8}", re.DOTALL)
 _LONGEST_NAME = 200  # bytes of a place's name in that of its holder
 
+# Name in a holder of the earlier directory, if the system cannot exchange two directories in one step.
 _BEFORE = ".before"
-"""Name in a holder of the earlier directory, if the system cannot exchange two directories in one step."""
 
+# Errors that only writing can cause, for any file name.
 _UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}
-"""Errors that only writing can cause, for any file name."""
 
 _LAST_WRITE_S = 0.05  # where writing is broken off by a signal, a thread of zarr still finishes the small file it is at
 
@@ -353,8 +353,8 @@ def describe_full_disk(error: Exception) -> str:
     return "no room for a copy here; TMPDIR names a place that has some" if full else ""
 
 
+# Begins a URL, also one that `pathlib.Path` has made ``s3:/bucket`` of.
 _LIKE_A_URL = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
-"""Begins a URL, also one that `pathlib.Path` has made ``s3:/bucket`` of."""
 
 
 def check_local_output(path: Location) -> Path:

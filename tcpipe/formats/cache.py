@@ -16,10 +16,10 @@ from pathlib import Path
 from tcpipe.errors import StoreError, UsageError
 
 _MOST_BYTES = 8_000_000_000
+# Fraction of the limit that a process may exceed before it scans the whole cache again, which takes time [1].
 _SHARE_UNSEEN = 64
-"""Fraction of the limit that a process may exceed before it scans the whole cache again, which takes time [1]."""
+# Bytes that this process has added since it last listed the cache; infinite before the first list.
 _unseen_bytes = [float("inf")]
-"""Bytes that this process has added since it last listed the cache; infinite before the first list."""
 _IN_USE_S = 60.0  # A file that was used within this time stays: another process may be about to open it
 
 

@@ -227,8 +227,8 @@ def _rank_recording(row: RunFacts) -> tuple[int, int, bool, str]:
     return recording.last_ns, recording.rows, not row.damage, row.log.sha256
 
 
+# Records that this process has read, of the place that it read last, by the names of their documents.
 _DECODED: dict[str, dict[str, Record]] = {}
-"""Records that this process has read, of the place that it read last, by the names of their documents."""
 
 
 def scan(place: Place) -> State:

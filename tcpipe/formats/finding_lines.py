@@ -187,8 +187,8 @@ def describe_label(name: str, finding: Finding | None) -> list[str]:
     return [f"{name}{size}", f"confirmed by: {witnesses}{missing}"]
 
 
+# Certainty of the scale of power by each witness.
 _PROVES = dict.fromkeys(("slope", "charge"), " (to a factor of three)") | {"second_meter": " (to a factor of two)"}
-"""Certainty of the scale of power by each witness."""
 
 
 def _format_size(key: str, numbers: Mapping[str, float]) -> str:

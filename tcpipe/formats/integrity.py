@@ -23,8 +23,8 @@ SEAL = "document_sha256"
 CHECKSUMS = "checksums.json"
 """In a directory whose files cannot be listed elsewhere: a sealed document with the key ``checksums``."""
 
+# The seal in canonical JSON; its hash is that of the text without this line.
 _SEAL_LINE = re.compile(rb'^  "document_sha256": "([0-9a-f]{64})"(,?)\n', re.MULTILINE)
-"""The seal in canonical JSON; its hash is that of the text without this line."""
 
 ALL_CHANGES = "; 'tcpipe verify {}' lists all changed files"
 """End of a message on one changed file."""

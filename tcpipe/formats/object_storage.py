@@ -35,12 +35,12 @@ _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[0-9a-f:]+\])(:\d{1,5})?(/[\w./-]*)?", re.IGNORECASE)
 _PIECE_BYTES = 1 << 24  # size of a request for a part of a large file [byte]
 _AT_ONCE = 8
+# Schemes with percent-encoded names; URLs of object stores are not encoded.
 _PERCENT_ENCODED = ("file", "http", "https")
-"""Schemes with percent-encoded names; URLs of object stores are not encoded."""
+# The first request of a process waits so long for an answer, and is repeated for so long: a user may be watching.
 _FIRST_S, _FIRST_RETRY_S = 4.0, 1.0
-"""The first request of a process waits so long for an answer, and is repeated for so long: a user may be watching."""
+# Time for which obstore repeats later requests [min], unless TCPIPE_RETRY_MINUTES is set: a store may restart.
 _RETRY_MINUTES = "10"
-"""Time for which obstore repeats later requests [min], unless TCPIPE_RETRY_MINUTES is set: a store may restart."""
 _MAX_RETRIES = 10_000  # more than fit into that time: the time alone decides
 _DENIED = (
     "169.254.169.254", "Account must be specified", "401 Unauthorized", "403 Forbidden", "Missing AccessKeyId", "Missing SecretAccessKey"
@@ -235,8 +235,8 @@ def _lay_out_stand_ins(
     return laid
 
 
+# By bucket and environment: whether the last request had an answer. Workers begin with True: their parent had one.
 _has_answered: dict[object, bool] = {}
-"""By bucket and environment: whether the last request had an answer. Workers begin with True: their parent had one."""
 
 
 def ask_store(

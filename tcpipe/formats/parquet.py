@@ -36,8 +36,8 @@ ROWS_PER_GROUP = 1 << 17
 MOST_BYTES, MOST_TIMES = 256_000_000, 100
 """Largest table in memory [byte], and in multiples of its file: ours shrink to a tenth, except constant columns."""
 _MOST_DEPTH = 4  # structs in one another in the header of a page
+# Bytes of a value, by physical type.
 _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}
-"""Bytes of a value, by physical type."""
 EMPTY_MEMBER = "structure_needs_at_least_one_member"
 
 

@@ -75,14 +75,13 @@ def ingest_key(recipe: Recipe | Mapping[str, Json]) -> str:
     return known[1]
 
 
+# The last recipe and its key, since many logs ask for the same one; the recipe is kept so that its id stays unique.
 _KEYS: dict[int, tuple[Recipe, str]] = {}
-"""The last recipe and its key, since many logs ask for the same one; the recipe is kept so that its id stays unique."""
 
 
 def _hash_values(values: Mapping[str, Json]) -> str:
     names = [section.name for section in fields(IngestSections)]
-    counted = {name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES}
-    return digest(counted)
+    return digest({name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES})
 
 
 def read_key(recipe: Recipe | IngestSections, robot: str | None, *, definitions: str) -> str:

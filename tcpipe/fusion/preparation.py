@@ -119,9 +119,8 @@ def _compute_rounding_variances(values: Floats) -> Floats:
     All axes have one grid: the smallest step between values, of which every step is a multiple. Rows with one value
     have the same error, which does not average out.
     """
-    steps = np.concatenate(
-        [np.diff(np.unique(axis.round(10))) for axis in values.T]
-    )  # ignore smaller binary differences
+    # Rounding removes the smaller differences of binary fractions.
+    steps = np.concatenate([np.diff(np.unique(axis.round(10))) for axis in values.T])
     multiples = steps / steps.min() if steps.size >= _MIN_COUNT else np.array([0.5])
     if (np.abs(multiples - np.rint(multiples)) > 0.01).any():
         return np.zeros(values.shape[1])

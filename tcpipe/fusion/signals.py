@@ -89,9 +89,8 @@ def hold_last(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
         return np.full(at_ns.size, np.nan)
     index = np.searchsorted(stamp_ns, at_ns, "right") - 1
     last = np.maximum(index, 0)
-    is_known = (index >= 0) & (
-        at_ns - stamp_ns[last] <= find_longest_step_ns(stamp_ns, 1_000_000_000)
-    )  # least holding time [ns]
+    # A value holds for a second at least.
+    is_known = (index >= 0) & (at_ns - stamp_ns[last] <= find_longest_step_ns(stamp_ns, 1_000_000_000))
     return np.where(is_known, values[last], np.nan)
 
 

@@ -261,8 +261,8 @@ unseen."""
 _CALLED_QUANTITY = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}
 _MOST_DRAWN = 5_000  # largest number of samples in a scatter plot; samples are in random order
 _WORST = 10  # samples of each split in the table of the largest errors
+# Between the ranges of slope along travel [deg]; the paper's robot climbs 22.5°.
 _SLOPE_EDGES_DEG = (-15.0, -10.0, -5.0, -2.0, 2.0, 5.0, 10.0, 15.0)
-"""Between the ranges of slope along travel [deg]; the paper's robot climbs 22.5°."""
 _SLOPE_NAMES = (
     *("below -15°", "-15° to -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°"),
     *("2° to 5°", "5° to 10°", "10° to 15°", "above 15°"),

@@ -27,8 +27,8 @@ from tcpipe.learning.fitting import mean_loss
 
 _TOGETHER = 256  # patches in one forward pass
 
+# Standard deviation of a standard normal variable that is truncated at ±2; Keras's ``he_normal`` divides by it.
 _TRUNCATED_STD = 0.87962566103423978
-"""Standard deviation of a standard normal variable that is truncated at ±2; Keras's ``he_normal`` divides by it."""
 
 
 class Normed(nn.Module):

@@ -44,8 +44,8 @@ gradient of a 1 × 1 convolution with a stride (its issue 6035); it crashed with
 
 _SLOWER = 0.1  # factor of the learning rate when the loss stops falling
 
+# Training that a crash loses at most, beyond an epoch [s]; an interruption loses only the epoch in which it occurs.
 _SECONDS_BETWEEN = 60.0
-"""Training that a crash loses at most, beyond an epoch [s]; an interruption loses only the epoch in which it occurs."""
 
 _LAST = 0.8  # share of the maximum of epochs after which the rate is smaller in any case
 

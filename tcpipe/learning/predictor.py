@@ -300,5 +300,4 @@ def compute_held_loss(held: Samples, predicted: Labels) -> float:
     """Return the loss of predictions of held-out samples, by the loss of the options."""
     scale = np.array(held.inputs.scale, np.float32)
     labels, predicted = (values.astype(np.float32) / scale for values in (held.labels, predicted))
-    factors = compute_loss_factors(held.config.loss, held.inputs.scale)
-    return float(mean_loss(predicted, labels, factors))
+    return float(mean_loss(predicted, labels, compute_loss_factors(held.config.loss, held.inputs.scale)))

@@ -39,8 +39,7 @@ from tcpipe.learning.predictor import Fitted, Inputs, Job, Patches, Prediction, 
 from tcpipe.recipe import TrainConfig
 from tcpipe.terrain.layers import HEIGHT_RANGE_M
 
-_OF_GROUND, _OF_BAND, _OF_OTHERS = 6, 2, 3
-"""Features of a channel."""
+_OF_GROUND, _OF_BAND, _OF_OTHERS = 6, 2, 3  # features of a channel
 
 
 def compute_patch_features(patches: Patches, *, channels: Sequence[str], class_count: int, patch_m: float) -> Floats:

@@ -80,8 +80,8 @@ class TrainResult:
         )
 
 
+# Number of parts of the runs, each predicted by the others; with fewer runs, folds are the clusters of errors.
 _PARTS = 5
-"""Number of parts of the runs, each predicted by the others; with fewer runs, folds are the clusters of errors."""
 
 
 def choose_kind(data: Dataset, config: FitConfig, split: Split | None = None) -> ModelKind:

@@ -196,9 +196,8 @@ def _convert_px4_imu(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> 
 
 def _convert_px4_battery(_log: Autopilot, _name: str, time_us: Ints, f: Columns) -> Stamped:
     voltage, current = f["voltage_v"], f["current_a"]
-    current_amp = np.where(
-        np.isin(current, UNMEASURED_AMP["battery_status"]), np.nan, -current
-    )  # negative in BatteryState
+    # A drawn current is negative in BatteryState.
+    current_amp = np.where(np.isin(current, UNMEASURED_AMP["battery_status"]), np.nan, -current)
     return time_us, {"voltage": np.where(voltage > 0, voltage, np.nan), "current": current_amp}
 
 

@@ -322,9 +322,8 @@ def _read_velocity_sentences(columns: Columns) -> Readings:
     of_velocity = {name: values[ground_velocity.row] for name, values in columns.items()}
     at_ns = of_velocity[LOG_TIME].astype(np.int64)
     time_of_day_ns = ground_velocity.time_of_day_ns
-    if (
-        ground_velocity.row.size and gga.row.size and (time_of_day_ns < 0).all()
-    ):  # VTG has no time: that of the fix which came with it
+    # VTG has no time: the time of the nearest fix is used.
+    if ground_velocity.row.size and gga.row.size and (time_of_day_ns < 0).all():
         beside_ns = columns[LOG_TIME].astype(np.int64)[gga.row]
         after = np.clip(np.searchsorted(beside_ns, at_ns), 1, max(1, gga.row.size - 1))
         before_is_nearer = at_ns - beside_ns[after - 1] <= beside_ns[np.minimum(after, gga.row.size - 1)] - at_ns

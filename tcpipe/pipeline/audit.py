@@ -111,8 +111,7 @@ def place_windows(span_s: float, length_s: float) -> Floats:
     inner_s = span_s - 2.0 * END_S
     count = max(int((inner_s + length_s) / (2.0 * length_s)), 0)
     gap_s = (inner_s - count * length_s) / max(count - 1, 1)
-    first_s = END_S + (0.5 * gap_s if count == 1 else 0.0)
-    starts_s = first_s + np.arange(count) * (length_s + gap_s)
+    starts_s = END_S + (0.5 * gap_s if count == 1 else 0.0) + np.arange(count) * (length_s + gap_s)
     return np.stack([starts_s, starts_s + length_s], -1)
 
 

@@ -86,8 +86,8 @@ class OpenCall:
         return Problem(make_finding(code, Subject("call", self.name), names=names, remedies=[remedy]), self.name)
 
 
+# After so long a call of a machine that cannot be asked from here is reported as lost: calls are made every night.
 _LONGEST_S = 86_400.0
-"""After so long a call of a machine that cannot be asked from here is reported as lost: calls are made every night."""
 CALL_PREFIX = "call-"
 
 
@@ -146,10 +146,8 @@ def record_call(
 ) -> Iterator[RunningCall]:
     """Record the begin of a call before the store is scanned, and its end; a killed or interrupted call has no end.
 
-    When it ends well, killed calls that were to do the same are closed.
-
-    ``works_on`` are logs and folders, or the output, in full; ``options`` distinguish its work from that of another
-    call.
+    A call that succeeds also closes killed calls with the same work. ``works_on`` are the full paths of logs and
+    folders, or of the output; calls with other ``options`` do other work.
     """
     begin_s, cpu_s = time.monotonic(), _read_cpu_s()
     names = [name for file in store.place.list("calls") if (name := parse_name("calls", file)) is not None]

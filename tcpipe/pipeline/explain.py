@@ -28,7 +28,6 @@ from tcpipe.tables.levels import GEOMETRY, Streams
 
 _NEARBY_NS = 5_000_000_000  # rejections this long before and after a segment are printed [ns]
 
-
 Value: TypeAlias = str | int | float | bool | None
 """Value of a column in one row."""
 
@@ -235,7 +234,6 @@ def flatten_recipe(recipe: Recipe) -> dict[str, Setting]:
 
 
 _DEFAULTS = flatten_recipe(Recipe())
-
 
 _SHOWN_LABELS = (
     ("power", "power_watt", "power_std_watt", 1, "W"),

@@ -133,10 +133,8 @@ def _find_hash(state: State, log: AnyLog) -> str:
     """
     outline, sha256 = log.outline, log.sha256()
     for row in state.runs.values() if outline else ():
-        only_index = outline in (
-            sha256,
-            row.log.sha256,
-        )  # where both are hashed as a whole, their hashes distinguish them
+        # Two logs whose whole contents are hashed differ if their hashes differ.
+        only_index = outline in (sha256, row.log.sha256)
         if row.log.outline == outline and only_index and not row.damage:
             return row.log.sha256
     return sha256
@@ -315,5 +313,4 @@ def run_stages(
         chord_m=sections.segment.chord_m,
     )
     segments = segment_track(masked, sections.segment)
-    labelled = label_segments(segments, masked, streams, sections.label, robot=profile)
-    return track, masked, labelled
+    return track, masked, label_segments(segments, masked, streams, sections.label, robot=profile)

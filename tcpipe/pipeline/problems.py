@@ -147,8 +147,7 @@ def _give_up(store: Store, state: State, problems: Sequence[Problem]) -> None:
 
 def forget_tables(store: Store, state: State, row: RunFacts) -> None:
     """Write that a run has no tables any more."""
-    document = state.names["runs", make_run_key(row.log.sha256, row.recipe_id)]
-    run = read_record(store.place, document, Run)
+    run = read_record(store.place, state.names["runs", make_run_key(row.log.sha256, row.recipe_id)], Run)
     store.put_run(state, replace(run, blob="", tables={}, streams_blob="", streams={}))
 
 

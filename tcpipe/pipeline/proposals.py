@@ -236,19 +236,19 @@ def _describe_sample(columns: Columns, topic: Topic, role: str) -> str:
     return count + "".join(f", {name} {format_first(columns[message])}" for name, message in shown[-3:])
 
 
+# By key of a table of the recipe its value, a note, and whether it is certain.
 _Values: TypeAlias = dict[str, tuple[TomlValue, str, bool]]
-"""By key of a table of the recipe its value, a note, and whether it is certain."""
 _STAMP = re.compile(
     r".*time(stamp|string)?(_(utc|local))?|(.*_)?(t|stamp|gpst|utc|date|epoch|millis|micros|ms_today|ms_of_day)|ms|us"
 )
+# Parts of a file's name that differ between runs: the last number, date and time, the first word.
 _RUN_TEXT = (r"\d+(?=\D*$)", r"\d(?:[\d_.:T-]*\d)?", r"^[^_. -]+(?=[_ -])")
-"""Parts of a file's name that differ between runs: the last number, date and time, the first word."""
 _TRIAL_NS = 60_000_000_000
 _SCALE_TOLERANCE = 0.03
+# Findings of the first minute that contradict a table of wheel odometry or of an IMU.
 _CONTRADICTIONS = ("distance-contradicted", "drives-backwards", "yaw-rate-sign")
-"""Findings of the first minute that contradict a table of wheel odometry or of an IMU."""
+# Findings on fixes of the first minute that come from wrong wheel odometry, except where few fixes are rejected.
 _DIFFERENCES = ("measurements-rejected", "gnss-contradicts-odometry", "sensor-changed")
-"""Findings on fixes of the first minute that come from wrong wheel odometry, except where few fixes are rejected."""
 _HINTS = {
     "gnss": r"(.*_)?(lat|lon|lng|gps|gnss|alt)\w*",
     "imu": r"(.*_)?(a|g|w|acc|gyr|imu|omega|rot)([a-z]*_?[xyz]|\w{2,})",

@@ -66,8 +66,7 @@ def report(
     if is_there:
         raise UsageError(f"{path}: is no dataset or store; give one of these, or a run of a store")
     opened = Store(store)
-    named = find_named_runs(path, store)
-    return _report_runs(named, StoredMaps(opened, opened.scan().maps))
+    return _report_runs(find_named_runs(path, store), StoredMaps(opened, opened.scan().maps))
 
 
 def _report_store(store: Store, ruling: Recipe, *, runs: bool) -> list[Page]:

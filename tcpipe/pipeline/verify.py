@@ -47,8 +47,8 @@ CheckResult = tuple[str, int] | str | Repair
 _COUNTS = {"track": "track_rows", "segments": "segments", "rejections": "rejections"}
 _KNOWN = "dataset, run, store, map (.zarr), model or cost map"
 
+# Kind of a directory, by the document with the checksums of its files.
 _KINDS = dict(zip(CARDS, ("dataset", "model", "cost map"), strict=True))
-"""Kind of a directory, by the document with the checksums of its files."""
 
 _HOW_MADE = {"dataset": "build", "model": "train", "cost map": "make"}
 

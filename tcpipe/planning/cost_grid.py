@@ -80,8 +80,8 @@ Cells = Ints
 
 CELLS_OF_BLOCK = BATCH // COURSES
 
+# Tiles across a strip of the map, of which three rows are in memory (`tcpipe.terrain.tiles`).
 _STRIP_TILES = CACHED_TILES // 3 - 3
-"""Tiles across a strip of the map, of which three rows are in memory (`tcpipe.terrain.tiles`)."""
 
 _ROWS_TOGETHER = 256
 
@@ -143,8 +143,7 @@ class CostGrid:
     def put(self, cells: Cells, found: SegmentPredictions) -> None:
         """Write the predictions of cells (flat indices, (n,)), 16 a cell, courses fastest."""
         for name in ("power_watt", "velocity_mps", "reasons"):
-            array = getattr(self, name)
-            array.reshape(COURSES, -1)[:, cells] = getattr(found, name).reshape(-1, COURSES).T
+            getattr(self, name).reshape(COURSES, -1)[:, cells] = getattr(found, name).reshape(-1, COURSES).T
         self.height_m.reshape(-1)[cells] = average_known(found.height_m.reshape(-1, COURSES), 1)
 
 

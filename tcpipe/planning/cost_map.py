@@ -279,8 +279,7 @@ def _write_files(directory: Path, strips: _Strips, frame: Frame) -> dict[str, Na
             ("best course, ccw from grid east", "deg"),
             ("std of a metre", unit),
         ]
-        strip = partial(strips.compute, name)
-        write_cog(directory / f"{name}.tif", strip, grid, dtype="float32", bands=bands)
+        write_cog(directory / f"{name}.tif", partial(strips.compute, name), grid, dtype="float32", bands=bands)
     bands = [(band, "bits") for band in (*_BAND_NAMES, "all courses")]
 
     def read_reasons(first: int, last: int) -> NDArray[np.uint16]:

@@ -148,9 +148,7 @@ def _find_class_reasons(patches: Patches, terrain: Bytes, model: Model, source: 
         seen[:], known[:] = True, True
     px = terrain.shape[1]
     lane = np.flatnonzero(np.abs((np.arange(px) + 0.5) / px - 0.5) * model.card.inputs.patch_m <= LANE_M / 2.0)
-    of_pixels = (
-        (~known + 2 * ~traversable).astype(np.uint8).take(terrain)
-    )  # 1: unknown, 2: blocked; one pass over the pixels
+    of_pixels = (~known + 2 * ~traversable).astype(np.uint8).take(terrain)  # 1: unknown, 2: blocked, in one pass
     unknown = (of_pixels & 1).any(axis=(1, 2))
     blocked = np.count_nonzero(of_pixels[:, lane[0] : lane[-1] + 1] & 2, axis=(1, 2)) / (lane.size * px)
     bits[~seen[patches.terrain_class] | unknown] |= np.uint16(Reason.CLASS_OUTSIDE_TRAINING)

@@ -15,8 +15,8 @@ from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 
+# From the map. A frame that begins further away has its longitude and latitude exchanged, or is of another site.
 _FARTHEST_ORIGIN_M = 100_000.0
-"""From the map. A frame that begins further away has its longitude and latitude exchanged, or is of another site."""
 
 
 _SLIVER = 0.05  # largest share of a cell at the edge of a map that gets no own cell

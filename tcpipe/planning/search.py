@@ -234,8 +234,7 @@ def compute_course_changes(start_xy_m: Floats, end_xy_m: Floats) -> Floats:
 
 _TURNS_RAD = np.radians(np.diff(np.append(ANGLES_DEG, 360.0)))  # from each course to the next [rad], shape (16,)
 
-_STEP, _LEFT, _RIGHT, _START = 1, 2, 3, 4
-"""Ways by which the search reaches a state; 0: not reached."""
+_STEP, _LEFT, _RIGHT, _START = 1, 2, 3, 4  # ways by which the search reaches a state; 0: not reached
 
 
 @compile_kernel

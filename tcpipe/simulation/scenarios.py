@@ -40,8 +40,8 @@ HUSKY_ROS1 = Recorder("ros1", "husky_status")
 Container = Literal["mcap", "bag", "rosbag2", "rosbag2_mcap"]
 """ROS 2 messages in MCAP (ROS 1 with the ROS 1 recorder); ROS 1 bag; ROS 2 bag directories with sqlite3 or MCAP."""
 
+# Two thirds of the small world, with a bent border.
 _WEST = ((1.0, 1.0), (80.0, 2.0), (74.0, 40.0), (80.0, 79.0), (2.0, 78.0))
-"""Two thirds of the small world, with a bent border."""
 _FIRST_START_NS = 1_700_000_000_000_000_000
 _BETWEEN_DRIVES_NS = 3_600_000_000_000
 

@@ -338,9 +338,8 @@ def read_wheels(truth: Truth, sensor: WheelOdometry, faults: Faults, noise: Nois
         velocity, yaw_rate = velocity * sensor.scale, yaw_rate * sensor.yaw_scale
     if faults.wheel_noise:
         rng = noise("wheels.noise")
-        turning = (np.abs(velocity) > 1e-6) | (
-            np.abs(yaw_rate) > 1e-6
-        )  # encoders of a stationary robot are exactly constant
+        # The encoders of a stationary robot are exactly constant.
+        turning = (np.abs(velocity) > 1e-6) | (np.abs(yaw_rate) > 1e-6)
         velocity = velocity + turning * sensor.std_mps * rng.standard_normal(stamp.size)
         yaw_rate = yaw_rate + turning * sensor.yaw_rate_std_radps * rng.standard_normal(stamp.size)
     x, y, yaw = _dead_reckon(velocity, yaw_rate, 1.0 / sensor.rate_hz)

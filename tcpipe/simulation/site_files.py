@@ -97,8 +97,7 @@ def simulate_readings(scenario: Scenario, index: int = 0, *, seed: int = 1) -> t
         scenario.world, plan, start_m=spec.start_m, start_ns=scenario.start_ns(index), robot=spec.robot,
         weave_m=spec.weave_m, rng=noise("drive"),
     )  # fmt: skip
-    sensors = spec.sensors.mounted(spec.faults)
-    return truth, record(truth, scenario.world.site, sensors, spec.faults, noise)
+    return truth, record(truth, scenario.world.site, spec.sensors.mounted(spec.faults), spec.faults, noise)
 
 
 def simulate_messages(scenario: Scenario, index: int = 0, *, seed: int = 1) -> tuple[Truth, list[MessageStream]]:

@@ -119,9 +119,8 @@ def _find_weak_sensors(facts: FuseFacts) -> Iterator[Finding]:
     for role, count in facts.measurements.items():
         rejected = facts.rejected[role]
         if rejected > read_threshold("measurements-rejected", "max_rejected_fraction") * count:
-            is_alone = {GNSS, WHEELS, VISUAL}.intersection(facts.sensors) <= {
-                role
-            }  # without any of them there is no track
+            # Without any of these sensors there is no track.
+            is_alone = {GNSS, WHEELS, VISUAL}.intersection(facts.sensors) <= {role}
             yield make_finding(
                 "measurements-rejected",
                 Subject("role", role),

@@ -87,9 +87,8 @@ def _make_segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) ->
     for name, source in (("fused", "forward"), ("commanded", "commanded")):
         signal = to_floats(rows, f"{source}_velocity_mps")
         columns[f"{name}_velocity_mps"] = mean_between(path.stamp_ns, signal, cut.start_ns, cut.end_ns)
-    std_m = np.hypot(
-        to_floats(rows, "x_std_m"), to_floats(rows, "y_std_m")
-    )  # DRMS: independent of the direction of the error
+    # DRMS: independent of the direction of the error
+    std_m = np.hypot(to_floats(rows, "x_std_m"), to_floats(rows, "y_std_m"))
     ends_m = [interpolate(path.stamp_ns, std_m, at_ns) for at_ns in (cut.start_ns, cut.end_ns)]
     return SEGMENTS.table(**columns, position_std_m=np.maximum(*ends_m))
 

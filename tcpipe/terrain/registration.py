@@ -196,9 +196,8 @@ def _find_ground(excess_m: Floats, xy_m: Floats) -> tuple[Mask, Mask]:
         residual_m = np.abs(residual_m - np.median(residual_m))
         row, column = np.clip(best, _NEAR, len(_SHIFT_M) - 1 - _NEAR) - _NEAR
         relief_m = np.ptp(excess_m[:, row : row + 2 * _NEAR + 1, column : column + 2 * _NEAR + 1], axis=(1, 2))
-        near = residual_m - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(
-            residual_m
-        )  # steep ground misfits by a step
+        # On steep ground, a shift by one step changes the residual by half of the relief.
+        near = residual_m - relief_m / 2.0 <= _OUTLIER * estimate_robust_std(residual_m)
         good = near & (relief_m < _CLIFF_M)
         if good.sum() < _FEWEST_POINTS:
             return near, near

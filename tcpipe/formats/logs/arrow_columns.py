@@ -1,7 +1,7 @@
-"""Serialised messages of one topic to Arrow columns.
+"""Conversion of the serialised messages of one topic to Arrow columns.
 
-`tcpipe.logs.wire_types` walks some thousand payloads at once. If all have one length, a field of all of them is a
-strided view.
+`tcpipe.logs.wire_types` parses thousands of payloads in one pass. If all payloads have the same length, each field is
+read as a strided view.
 """
 
 from collections.abc import Iterator, Sequence
@@ -49,7 +49,7 @@ _Int64 = Ints
 def make_arrow_schema(message: Record) -> pa.Schema:
     """Return the schema of a topic's table: both times, then the message's fields by dotted name.
 
-    A field of the message that is called like one of the times gets ``_`` behind its name.
+    A message field that has the name of a time column gets ``_`` appended to its name.
     """
     fields = [pa.field(name, pa.int64()) for name in (LOG_TIME, PUBLISH_TIME)]
     taken = {LOG_TIME, PUBLISH_TIME}
@@ -63,7 +63,7 @@ def make_arrow_schema(message: Record) -> pa.Schema:
 
 
 class TopicTable:
-    """Collects the messages of one topic and one definition, and gives them as tables in the order of log time."""
+    """Collects the messages of one topic and one definition, and returns them as tables in the order of log time."""
 
     def __init__(self, message_type: MessageType, encoding: str) -> None:
         self.schema = make_arrow_schema(message_type.wire)
@@ -77,7 +77,7 @@ class TopicTable:
         """Approximate memory of the messages that are not in a returned table yet [byte]."""
         self._wire, self._dialect = message_type.wire, ROS1 if encoding == "ros1" else CDR
         self._gathered: list[tuple[_Int64, Bytes, _Int64]] = []
-        """Rows of messages, their payloads one after the other, and how long each is."""
+        """Row numbers, concatenated payloads and payload lengths [byte] of each block."""
         self._gathered_bytes = 0
         self._times: list[tuple[_Int64, _Int64, _Int64]] = []
         self._parts: list[tuple[_Int64, pa.Table]] = []
@@ -105,8 +105,8 @@ class TopicTable:
     def take(self, *, share: float = 1.0) -> pa.Table:
         """Return and remove the collected messages, sorted by log time (equal times in the order of the log).
 
-        With a ``share`` below 1, return about this share, the earliest ones. The others stay for messages that arrive
-        later but belongs before it.
+        With a ``share`` below 1, return about this share, the earliest ones. The other rows stay, because a
+        message that arrives later may precede them.
         """
         self._flush()
         if not self._parts:
@@ -128,7 +128,7 @@ class TopicTable:
         return table[:count]
 
     def _joined(self, times: Sequence[_Int64]) -> pa.Table:
-        """Return all parts as one table of many pieces, both times before the fields."""
+        """Concatenate all parts into one table, with both times before the fields."""
         log, publish, _ = times
         fields = pa.concat_tables([table for _, table in self._parts])
         arrays = [[number_column(log)], [number_column(publish)], *(column.chunks for column in fields.columns)]
@@ -138,7 +138,7 @@ class TopicTable:
         )
 
     def _hold(self, table: pa.Table, times: tuple[_Int64, ...], count: int) -> None:
-        """Keep all rows from ``count`` on."""
+        """Keep the rows from ``count`` on for later tables."""
         total = len(times[0])
         held_bytes = self.held_bytes * (total - count) // total
         self._forget()
@@ -152,7 +152,7 @@ class TopicTable:
         self._times, self._parts = [], []
 
     def _flush(self) -> None:
-        """Turn the messages gathered into parts of the table."""
+        """Decode the gathered messages into a part of the table."""
         if not self._gathered:
             return
         rows, lengths = (np.concatenate([piece[at] for piece in self._gathered]) for at in (0, 2))
@@ -170,14 +170,14 @@ class TopicTable:
                 self._decode(rows[fits], data, starts[fits], ends[fits])
 
     def _has_head(self, data: Bytes, starts: _Int64, lengths: _Int64) -> Mask:
-        """Return which messages begin like those of the encoding."""
+        """Mark the messages that begin with the header of their encoding, shape (N,)."""
         fits = lengths >= self._dialect.origin
         if self._dialect is CDR and fits.any():
             fits[fits] = gather_integers(data.data, starts[fits], "u2") == _CDR_HEAD
         return fits
 
     def _decode(self, rows: _Int64, data: Bytes, starts: _Int64, ends: _Int64) -> None:
-        """Decode messages in parallel columns; messages that do not fit their definition are counted and left out."""
+        """Decode messages into columns; count and exclude messages that do not fit their definition."""
         walked = walk(self._wire, data, starts, ends, self._dialect)
         if walked.root:
             walked_columns = WalkedColumns(data)
@@ -193,7 +193,7 @@ class TopicTable:
 
 
 def _gather_payloads(buffer: memoryview, offsets: _Int64, length: int) -> Bytes:
-    """Return messages of one length one after the other."""
+    """Return the payloads of messages of equal length [byte], concatenated."""
     if not length:
         return np.zeros(0, np.uint8)
     return gather_values(buffer, offsets, np.dtype(f"V{length}")).view(np.uint8)
@@ -214,21 +214,21 @@ def find_arrow_type(wire_type: WireType) -> pa.DataType:
 
 def make_texts(count: int, offsets: pa.Buffer, raw: pa.Buffer) -> tuple[pa.StringArray, int]:
     """Return texts from Arrow's offsets and bytes, and the number of invalid UTF-8 texts; bad bytes are replaced."""
-    found = pa.StringArray.from_buffers(count, offsets, raw)
+    texts = pa.StringArray.from_buffers(count, offsets, raw)
     if not (np.frombuffer(raw, np.uint8) & 0x80).any():
-        return found, 0
+        return texts, 0
     try:
-        found.validate(full=True)
+        texts.validate(full=True)
     except pa.ArrowInvalid:
-        pieces = found.cast(pa.binary()).to_pylist()
+        pieces = texts.cast(pa.binary()).to_pylist()
         decoded = [piece.decode(errors="replace") for piece in pieces]
         replaced = sum(text.encode() != piece for text, piece in zip(decoded, pieces, strict=True))
         return pa.array(decoded, pa.string()), replaced
-    return found, 0
+    return texts, 0
 
 
 def make_lists(values: pa.Array, counts: _Int64, length: int | None) -> pa.Array:
-    """Return ``values`` as lists of ``counts`` elements; ``length`` is given where the definition fixes it."""
+    """Return lists of ``counts`` elements each; ``length`` is their common length if the definition fixes it."""
     if length:
         return pa.FixedSizeListArray.from_arrays(values, length)
     offsets = np.zeros(len(counts) + 1, np.int32)
@@ -252,6 +252,7 @@ class WalkedColumns:
                 yield self._array(values, field)
 
     def _array(self, values: Values, wire_type: WireType) -> pa.Array:
+        """Return the Arrow array of one field of all messages."""
         match values, wire_type:
             case Fields(), Record():
                 children = [
@@ -264,9 +265,9 @@ class WalkedColumns:
                 elements = number_column(np.frombuffer(self._compact(values)[1], dtype))
                 return make_lists(elements, values.lengths // dtype.itemsize, wire_type.length)
             case Runs(), Text():
-                found, replaced = make_texts(len(values.lengths), *self._compact(values))
+                texts, replaced = make_texts(len(values.lengths), *self._compact(values))
                 self.replaced_texts += replaced
-                return found
+                return texts
             case Scalars(places=Grid() as grid, dtype=dtype), Scalar():
                 return number_column(grid.view(self._data, dtype))
             case Scalars(places=np.ndarray() as offsets, dtype=dtype), Scalar():
@@ -274,10 +275,10 @@ class WalkedColumns:
         raise TypeError(f"{type(values).__name__} are no values of {wire_type}")
 
     def _compact(self, runs: Runs) -> tuple[pa.Buffer, pa.Buffer]:
-        """Copy runs together; return Arrow's offsets and the bytes.
+        """Concatenate runs of bytes; return Arrow's offsets and the bytes.
 
-        As runs rise, their bounds are those of an Arrow array in which every other element is a gap: `take` leaves the
-        gaps out.
+        Runs are sorted by offset. Their bounds therefore describe an Arrow array in which every other element is the
+        gap between two runs; `take` skips the gaps.
         """
         count = len(runs.lengths)
         if isinstance(runs.places, Grid):

@@ -1,4 +1,4 @@
-"""Autopilot logs by the interface of a log: each message name is a topic; and the topics that roles can use.
+"""Autopilot logs with the interface of a log: one topic for each message name, and topics that roles can use.
 
 ``/sensor_combined`` has PX4's own fields, which the recipe can map; ``/sensor_combined/imu`` has them as
 sensor_msgs/Imu.
@@ -41,17 +41,17 @@ _HEAD = b"\xa3\x95"
 _FORMAT, _FORMAT_BYTES = 0x80, 89
 _STRAY_US, _LATE_US = 1_000_000, 3_600 * 10**6
 _WINDOW = 5  # number of successive messages whose median reveals a wrong stamp
+# Most digits of a list's length, and most levels of nested formats [1]; a format with more is damaged.
 _MOST_DIGITS, _DEEPEST = 5, 5
-"""Most digits of a list's length, and most levels of nested formats [1]; a format with more is damaged."""
 
 Layout = np.dtype[np.void]
 
 
 @dataclass(slots=True)
 class AutopilotMessages:
-    """Messages of one name and instance, by time since boot [µs], with the offsets in the file of their fields.
+    """Messages of one name and instance: times since boot [µs] and offsets in the file, shape (N,) each.
 
-    ``scales`` are by field: the size of one integer step in the field's unit.
+    ``scales`` maps a field to the size of one integer step in the field's unit.
     """
 
     name: str
@@ -61,7 +61,7 @@ class AutopilotMessages:
     scales: Mapping[str, float]
 
     def read_columns(self, data: bytes) -> dict[str, AnyArray]:
-        """Return the fields by name, shape (N,) or (N, k)."""
+        """Return the values of each field by its name, shape (N,) or (N, k)."""
         rows = gather_values(data, self.offsets, self.layout)
         return {
             name: rows[name] * self.scales[name] if name in self.scales else rows[name]
@@ -70,13 +70,13 @@ class AutopilotMessages:
 
 
 def _gather_field(data: bytes, offsets: Ints, layout: Layout, name: str) -> Ints:
-    """Return a whole number of each message."""
+    """Return the integer field ``name`` of each message, shape (N,)."""
     offset: int = layout.fields[name][1]  # type: ignore[index]  # a layout that has the field has fields
     return gather_integers(data, offsets + offset, layout[name].str[1:].replace("u8", "i8"))
 
 
 _CLOCKS = {"timestamp": 1, "TimeUS": 1, "T": 1000, "TimeMS": 1000}
-"""Unit of a time field [µs], by name; ArduPilot wrote milliseconds before 2015; a GPS's TimeMS is that of the week."""
+"""Unit of a time field [µs], by name; ArduPilot wrote milliseconds before 2015; the TimeMS of a GPS counts from the start of the week."""
 
 
 @dataclass(slots=True)
@@ -100,7 +100,7 @@ class AutopilotRecords:
         self._note(Damage(cause, self.path.name, topic=topic, messages_lost=lost, reason=reason, places=places))
 
     def skip_to(self, start: int, end: int) -> int:
-        """Return ``end``, up to where the file cannot be read from ``start``."""
+        """Record that the bytes from ``start`` to ``end`` cannot be read; return ``end``."""
         cause = "record-damaged" if end < len(self.data) else "file-cut"
         self._note(Damage(cause, self.path.name, offset=start, bytes_lost=end - start))
         return end
@@ -110,7 +110,7 @@ class AutopilotRecords:
             self.damage[damage] = None
 
     def add(self, name: str, instance: int, layout: Layout, offsets: Ints, scales: Mapping[str, float]) -> None:
-        """Add the messages of an instance; without a time they cannot be used."""
+        """Add the messages of an instance; record damage instead if they have no time."""
         clock = next(
             (field for field in _CLOCKS if field in (layout.names or ()) and layout[field].str in ("<u8", "<u4")), None
         )
@@ -125,7 +125,7 @@ class AutopilotRecords:
         )
 
     def sort_by_time(self) -> None:
-        """Sort messages by time; those with a stamp far from their neighbours or the log's end are dropped, counted."""
+        """Sort messages by time; exclude and count times that are far from their neighbours' or the log's end."""
         ends = [
             float(np.median(message.time_us[-_WINDOW:]))
             for message in self.messages.values()
@@ -133,10 +133,10 @@ class AutopilotRecords:
         ]
         latest_us = min(max(ends, default=LATEST_US) + _LATE_US, LATEST_US)
         for name, message in list(self.messages.items()):
-            known = (message.time_us >= 0) & (message.time_us <= latest_us) & ~_find_stray(message.time_us)
-            if lost := int(np.count_nonzero(~known)):
+            is_valid = (message.time_us >= 0) & (message.time_us <= latest_us) & ~_find_stray(message.time_us)
+            if lost := int(np.count_nonzero(~is_valid)):
                 self.add_damage("time-invalid", f"/{name}", lost)
-            message.offsets, message.time_us = message.offsets[known], message.time_us[known]
+            message.offsets, message.time_us = message.offsets[is_valid], message.time_us[is_valid]
             if late := int(np.count_nonzero(np.diff(message.time_us) < 0)):
                 self.add_damage("messages-unordered", f"/{name}", 0, places=late)
                 order = np.argsort(message.time_us, kind="stable")
@@ -146,7 +146,7 @@ class AutopilotRecords:
 
 
 def _find_stray(time_us: Ints) -> Mask:
-    """Return which times, in the order of the file, are far from the median of those around them."""
+    """Mark times, in the order of the file, that are far from the median of their neighbours, shape (N,)."""
     steps = np.diff(time_us)
     if len(time_us) < _WINDOW or not (steps < 0).any():
         return np.zeros(len(time_us), bool)
@@ -191,7 +191,7 @@ def _parse_field(text: str) -> tuple[str, int, str] | None:
 
 @dataclass(slots=True)
 class _UlogTopic:
-    """A subscription: messages of a format, their sizes [byte] with and without padding, and their fields' offsets."""
+    """A subscribed topic: layout of its messages, their largest size with padding [byte], and their offsets."""
 
     name: str
     instance: int
@@ -278,10 +278,11 @@ class _UlogReader:
                 self._records.dropouts += 1
             case "A" | "P":
                 self._records.skip_to(at - 3, at + size)
-            case _:  # texts of the log, facts on it, synchronisation
+            case _:  # log texts, information and synchronisation are not used
                 pass
 
     def _subscribe(self, instance: int, number: int, name: str) -> None:
+        """Add the topic of a subscription; record damage if the layout of its messages is unknown."""
         if name not in self._layouts:
             self._layouts[name] = self._make_layout(name)
             if self._columns > MAX_COLUMNS:
@@ -312,7 +313,7 @@ class _UlogReader:
             return f"its format {name} is damaged ({error})"
 
     def _iterate_fields(self, name: str, prefix: str, depth: int) -> Iterator[tuple[str, DTypeLike]]:
-        """Yield the fields of a format, those of formats in it as ``outer.inner`` or, of several, ``outer_0.inner``."""
+        """Yield name and type of each field; a nested format gives ``outer.inner``, an array of them ``outer_0.inner``."""
         if depth > _DEEPEST:
             raise ValueError("formats inside formats")
         for type_name, count, field_name in self._formats[name]:
@@ -344,11 +345,11 @@ def _read_dataflash(records: AutopilotRecords) -> None:
     lengths, offsets = [0] * 256, [list[int]() for _ in range(256)]
     formats: dict[int, tuple[str, Layout, dict[str, float]]] = {}
     lengths[_FORMAT] = _FORMAT_BYTES
-    begins = data.startswith
+    starts_with = data.startswith
     while at + 3 <= end_of_data:
         kind = data[at + 2]
         end = at + lengths[kind]
-        if end > at and (begins(_HEAD, end) or end == end_of_data) and begins(_HEAD, at):
+        if end > at and (starts_with(_HEAD, end) or end == end_of_data) and starts_with(_HEAD, at):
             offsets[kind].append(at + 3)
             if kind == _FORMAT:
                 _define_format(data, at + 3, lengths, formats)
@@ -396,9 +397,11 @@ def _define_format(
     """Read a format. The first one with a number is used; a contradictory one only gives the length of its messages."""
     kind, length, name, letters, labels = struct.unpack_from("<BB4s16s64s", data, at)
     codes = [_DATAFLASH_TYPES.get(letter) for letter in letters.rstrip(b"\0").decode("latin-1")]
-    given = [*labels.rstrip(b"\0").decode("ascii", "replace").split(","), *[""] * len(codes)]
-    known = [code for code in codes if code is not None]
-    fields = {name or f"field_{index}": code for index, (name, code) in enumerate(zip(given, known, strict=False))}
+    field_names = [*labels.rstrip(b"\0").decode("ascii", "replace").split(","), *[""] * len(codes)]
+    known_codes = [code for code in codes if code is not None]
+    fields = {
+        name or f"field_{index}": code for index, (name, code) in enumerate(zip(field_names, known_codes, strict=False))
+    }
     layout = np.dtype([(field_name, code) for field_name, (code, _) in fields.items()])
     if kind not in formats and length > len(_HEAD):
         is_whole = len(fields) == len(codes) and layout.itemsize + 3 == length
@@ -410,7 +413,7 @@ def _define_format(
 def _add_instances(
     records: AutopilotRecords, name: str, layout: Layout, offsets: Ints, scales: Mapping[str, float]
 ) -> None:
-    """Add messages, those of each instance of a sensor apart."""
+    """Add the messages of each instance of a sensor separately."""
     instance = next(
         (field for field in _INSTANCES if field in (layout.names or ()) and layout[field].str == "|u1"), None
     )
@@ -428,9 +431,10 @@ _OWN_PACKAGES = {"ulog": "px4", "dataflash": "ardupilot"}
 def open_autopilot_log(path: Path, kind: AutopilotKind, stack: ExitStack) -> TableLog:
     """Read a ``ulog`` or ``dataflash`` log; ``stack`` is closed with it. `LogError`: it cannot be read."""
     records = read_autopilot_records(path, kind)
-    known = {name: message for name, message in records.messages.items() if _find_base(name) in CONVERTED}
+    convertible = {name: message for name, message in records.messages.items() if _find_base(name) in CONVERTED}
     messages = {
-        name: (message.time_us, select_fields(message.read_columns(records.data))) for name, message in known.items()
+        name: (message.time_us, select_fields(message.read_columns(records.data)))
+        for name, message in convertible.items()
     }
     log = Autopilot(kind, messages, records.parameters)
     with np.errstate(all="ignore"):  # users of the values count those that are not finite
@@ -465,7 +469,7 @@ def _find_base(name: str) -> str:
 
 
 def _make_stamped(messages: RoleMessages, stamp_ns: Ints, lever_arms: LeverArms) -> Fields:
-    """Return a message's fields with stamp and frame; its values are in base_link if no transform places an IMU."""
+    """Return the fields of a role's messages with stamp and frame; the frame is base_link for an IMU without transform."""
     frame = "base_link" if messages.frame == "imu" and messages.frame not in lever_arms else messages.frame
     column = "child_frame_id" if messages.type_name == ODOMETRY else "header.frame_id"
     return {**make_stamp_fields(stamp_ns), **messages.columns, column: pa.repeat(frame, len(stamp_ns))}

@@ -2,8 +2,7 @@
 
 A record is a header (fields ``name=value``) and data, each after its length (uint32). Chunks hold connections and
 messages; after a chunk there is an index record for each of its connections; the file ends with all connections and a
-summary of every chunk. A bag contains no checksums: only chunks in bz2 have one, chunks in lz4 or without compression
-have none.
+summary of every chunk. Of the chunks, only those in bz2 have a checksum.
 """
 
 import struct
@@ -66,7 +65,7 @@ class BagRecord:
 
 @dataclass(slots=True)
 class ChunkRecords:
-    """Records of a chunk: connections, each connection's messages, the end of the records, and their number."""
+    """Records of a chunk: connections, offsets and stamps of messages by connection, end and number of all records."""
 
     connections: list[BagRecord] = field(default_factory=list)
     offsets: dict[int, list[int]] = field(default_factory=dict)
@@ -87,15 +86,15 @@ class ChunkRecords:
 
 
 def walk_chunk(data: memoryview, most: int) -> ChunkRecords:
-    """Step through the records of a chunk; one that does not fit, or is one too many, ends the walk.
+    """Read the records of a chunk until one is invalid, exceeds the chunk, or there are more than ``most``.
 
-    A message's header differs from the one before it in connection and time only, so that most need no parsing.
+    Headers of messages of one connection differ only in time, so that most headers need no parsing.
     """
-    found, position, size = ChunkRecords(), 0, len(data)
+    records, position, size = ChunkRecords(), 0, len(data)
     length_at = struct.Struct("<I").unpack_from
-    known: dict[bytes, int] = {}
+    connection_by_header: dict[bytes, int] = {}
     time_at = 0
-    while position + 8 <= size and found.count <= most:
+    while position + 8 <= size and records.count <= most:
         header_end = position + 4 + length_at(data, position)[0]
         if header_end + 4 > size:
             break
@@ -103,26 +102,26 @@ def walk_chunk(data: memoryview, most: int) -> ChunkRecords:
         if end > size:
             break
         header = bytes(data[position + 4 : header_end])
-        connection = known.get(header[:time_at] + header[time_at + 8 :])
+        connection = connection_by_header.get(header[:time_at] + header[time_at + 8 :])
         if connection is None:
             try:
                 record = BagRecord(parse_header_fields(header), header_end + 4, end - header_end - 4)
                 if record.opcode == OP_CONNECTION:
-                    found.connections.append(record)
+                    records.connections.append(record)
                 elif record.opcode == OP_MESSAGE:
                     connection = record.number(b"conn")
                     stamp_ns(record.fields, b"time")
                     time_at = header.find(b"time=") + 5
-                    known[header[:time_at] + header[time_at + 8 :]] = connection
+                    connection_by_header[header[:time_at] + header[time_at + 8 :]] = connection
             except DamageError:
                 break
         if connection is not None:
             seconds, nanoseconds = _TIME.unpack_from(header, time_at)
-            found.offsets.setdefault(connection, []).append(position)
-            found.stamps.setdefault(connection, []).append(seconds * NS + nanoseconds)
-        found.end = position = end
-        found.count += 1
-    return found
+            records.offsets.setdefault(connection, []).append(position)
+            records.stamps.setdefault(connection, []).append(seconds * NS + nanoseconds)
+        records.end = position = end
+        records.count += 1
+    return records
 
 
 def parse_header_fields(header: bytes | memoryview) -> dict[bytes, bytes]:
@@ -163,17 +162,17 @@ def _find_message_fields(header: bytes) -> tuple[int, int]:
 _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MAX_CHUNK_HEADER = 128
 _INDEX_ENTRY_BYTES = 12
-_INDEX_HEAD_BYTES = 64  # as much as an index record's header takes as a rule, and the length behind it
+_INDEX_HEAD_BYTES = 64  # usual size of an index record's header and of the length after it
 _PLACED_AT_ONCE = 1024  # number of chunks whose headers are read together
-_EXPECTED_BYTES = 1 << 24  # an index is seldom longer, and a broken header may place it anywhere
+_EXPECTED_BYTES = 1 << 24  # an index is seldom longer; a damaged header may claim any size
 
 
 @dataclass(frozen=True, slots=True)
 class _Chunk:
-    """A chunk, and its number of messages by connection; ``counts`` is None if only its records contain them.
+    """A chunk and its number of messages by connection; ``counts`` is None if the bag has no index.
 
-    ``record`` is the record at ``offset`` (None before it is read, or if it is damaged), ``size`` that of its records
-    [byte].
+    ``record`` is the chunk's own record (None before it is read, or if it is damaged); ``size`` is the size of the
+    records in it [byte].
     """
 
     offset: int
@@ -202,6 +201,7 @@ class BagPart(ChunkedPart[_Chunk]):
     least_bytes = 8
 
     def _open(self) -> dict[int, Topic]:
+        """Read the index, or every record if the index cannot be used; return the topic of each connection."""
         self._connections: dict[int, _Connection] = {}
         self._chunks: list[_Chunk] = []
         try:
@@ -215,25 +215,25 @@ class BagPart(ChunkedPart[_Chunk]):
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, _Chunk]]:
         """Return the chunks that may contain requested connections, each with an upper bound of the bytes before it."""
-        found, sizes = [], []
+        selected, sizes = [], []
         for first in range(0, len(self._chunks), _PLACED_AT_ONCE):
             chunks = self._chunks[first : first + _PLACED_AT_ONCE]
             self._bytes.expect([(chunk.offset, _MAX_CHUNK_HEADER) for chunk in chunks])
             chunks = [self._placed(chunk) for chunk in chunks]
             self._bytes.expect([(chunk.record.end, _INDEX_HEAD_BYTES) for chunk in chunks if chunk.record])
             sizes += [chunk.size for chunk in chunks]
-            found += [
+            selected += [
                 (number * MAX_CHUNK_BYTES, chunk)
                 for number, chunk in enumerate(chunks, start=first)
                 if chunk.counts is None or not wanted.isdisjoint(chunk.counts) or self._is_doubtful(chunk)
             ]
         self._bounds.claim(sizes)
-        if len(found) < len(self._chunks):
+        if len(selected) < len(self._chunks):
             self._bytes.skips()
-        return found
+        return selected
 
     def _is_doubtful(self, chunk: _Chunk) -> bool:
-        """Return whether the index of a chunk contradicts the summary, which lists no requested connection in it."""
+        """Return whether the index after a chunk is damaged or contradicts the summary of the chunk."""
         try:
             self._index_of(chunk)
         except DamageError:
@@ -252,41 +252,41 @@ class BagPart(ChunkedPart[_Chunk]):
     def read_indexed(self, found: Excerpt) -> tuple[Messages, Mask]:
         """Return the messages of an excerpt, and which of them agree with the chunk's index.
 
-        Headers of messages agree but for connection and time, so the first is parsed and the others compared to it.
+        Headers of messages differ only in connection and time: the first one is parsed, and the others are compared
+        with it.
         """
         data, offset, entries = found.data, found.offset, found.entries
-        none = Messages(data, entries.channel, offset, offset, offset, entries.log_time_ns, entries.log_time_ns)
+        unread = Messages(data, entries.channel, offset, offset, offset, entries.log_time_ns, entries.log_time_ns)
         if not len(offset):
-            return none, np.zeros(0, bool)
-        room = entries.end - entries.offset
+            return unread, np.zeros(0, bool)
+        available_bytes = entries.end - entries.offset
         length = int(gather_integers(data, offset[:1], "u4")[0])
-        fits = room >= length + 8
+        fits = available_bytes >= length + 8
         if not fits[0] or length > MAX_HEADER_BYTES:
-            return none, np.zeros(len(offset), bool)
+            return unread, np.zeros(len(offset), bool)
         windows: Bytes = np.ndarray((len(data) - length - 7, length + 8), np.uint8, data, 0, (1, 1))
         heads = windows[np.where(fits, offset, offset[0])]
         conn_at, time_at = _find_message_fields(heads[0, 4 : length + 4].tobytes())
         if not conn_at or not time_at:
-            return none, np.zeros(len(offset), bool)
+            return unread, np.zeros(len(offset), bool)
         varies = np.zeros(length + 8, bool)
         varies[conn_at : conn_at + 4] = varies[time_at : time_at + 8] = varies[length + 4 :] = True
         channel = heads[:, conn_at : conn_at + 4].copy().view("<u4")[:, 0].astype(np.int64)
         times = heads[:, time_at : time_at + 8].copy().view("<u4").astype(np.int64)
         stamp_ns = times[:, 0] * NS + times[:, 1]
         payload_bytes = heads[:, length + 4 :].copy().view("<u4")[:, 0].astype(np.int64)
-        true: Mask = (
+        agrees: Mask = (
             fits
             & (channel == entries.channel)
             & (stamp_ns == entries.log_time_ns)
-            & (length + 8 + payload_bytes <= room)
+            & (length + 8 + payload_bytes <= available_bytes)
             & ((heads == heads[0]) | varies).all(axis=1)
         )
-        return Messages(data, channel, offset, offset + (length + 8), payload_bytes, stamp_ns, stamp_ns), true
+        return Messages(data, channel, offset, offset + (length + 8), payload_bytes, stamp_ns, stamp_ns), agrees
 
     def read_walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
         """Return the requested messages of a chunk from its records; missing ones are added to ``damage``."""
-        found = self._step_through(chunk, data)
-        return found.messages(data, wanted)
+        return self._step_through(chunk, data).messages(data, wanted)
 
     def is_proved(self, chunk: _Chunk) -> bool:
         """Return whether the chunk has a checksum: only bz2 has one."""
@@ -297,7 +297,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return chunk.counts is not None and not chunk.cut
 
     def _step_through(self, chunk: _Chunk, data: memoryview) -> ChunkRecords:
-        """Yield the records of a chunk, and record their damage."""
+        """Return the records of a chunk; record their damage and differences from the index."""
         walked = walk_chunk(data, self._bounds.most_records)
         self._bounds.walk(chunk.offset, walked.count)
         for connection in walked.connections if chunk.counts is None else ():
@@ -314,45 +314,45 @@ class BagPart(ChunkedPart[_Chunk]):
         return walked
 
     def read_indexes(self, chunks: list[_Chunk]) -> tuple[tuple[Ints, ...], Sequence[int]]:
-        """Return the messages of several chunks by the index records behind them."""
-        held: list[bytes] = []
-        places: list[tuple[int, int, int]] = []
-        unsound = []
+        """Return the messages that index records after chunks list, and the numbers of chunks without a valid index."""
+        entry_bytes: list[bytes] = []
+        groups: list[tuple[int, int, int]] = []
+        invalid = []
         records = [(chunk.offset, chunk.record) for chunk in chunks if chunk.record]
         starts = [(r.end if r.codec == "none" else offset, r.end) for offset, r in records]  # plain: indexes only
         self._bytes.expect([(start, end + _INDEX_HEAD_BYTES - start) for start, end in starts])
         for number, chunk in enumerate(chunks):
             try:
-                found = self._index_of(chunk)
+                index = self._index_of(chunk)
             except DamageError:
-                unsound.append(number)
+                invalid.append(number)
                 continue
-            held += [entries for _, entries in found]
-            places += [(number, connection, len(entries) // _INDEX_ENTRY_BYTES) for connection, entries in found]
-        chunk_number, connections, counts = np.array(places, np.int64).reshape(-1, 3).T
-        words = np.frombuffer(b"".join(held), "<u4").reshape(-1, 3).astype(np.int64)
+            entry_bytes += [entries for _, entries in index]
+            groups += [(number, connection, len(entries) // _INDEX_ENTRY_BYTES) for connection, entries in index]
+        chunk_number, connections, counts = np.array(groups, np.int64).reshape(-1, 3).T
+        words = np.frombuffer(b"".join(entry_bytes), "<u4").reshape(-1, 3).astype(np.int64)
         stamps_ns = words[:, 0] * NS + words[:, 1]
-        return (np.repeat(chunk_number, counts), np.repeat(connections, counts), words[:, 2], stamps_ns), unsound
+        return (np.repeat(chunk_number, counts), np.repeat(connections, counts), words[:, 2], stamps_ns), invalid
 
     def _index_of(self, chunk: _Chunk) -> list[tuple[int, bytes]]:
         """Return each connection's entries in the index behind a chunk; `DamageError` if it is missing or damaged."""
         counts = chunk.counts
         if counts is None or chunk.cut or chunk.record is None:
             raise DamageError("chunk-index-damaged")
-        found, position = [], chunk.record.end
+        index, position = [], chunk.record.end
         for _ in counts:
             record = self._record(position)
             if record.opcode != OP_INDEX or record.data_bytes % _INDEX_ENTRY_BYTES:
                 raise DamageError("chunk-index-damaged")
             connection, start, size = (record.number(b"conn"), record.data_offset, record.data_bytes)
-            found.append((connection, self._bytes.peek(start, size)))
+            index.append((connection, self._bytes.peek(start, size)))
             position = start + size
-        if {connection: len(entries) // _INDEX_ENTRY_BYTES for connection, entries in found} != counts:
+        if {connection: len(entries) // _INDEX_ENTRY_BYTES for connection, entries in index} != counts:
             raise DamageError("chunk-index-damaged")
-        return found
+        return index
 
     def find_plain_data(self, chunk: _Chunk) -> int | None:
-        """Return where the records of a chunk begin that is not compressed."""
+        """Return the file offset of the records of an uncompressed chunk; None for a compressed one."""
         record = chunk.record
         if record is None or record.opcode != OP_CHUNK or record.codec != "none":
             return None
@@ -370,9 +370,9 @@ class BagPart(ChunkedPart[_Chunk]):
             raise DamageError("record-damaged")
         if chunk.cut:
             data = self._bytes.read(record.data_offset, self._bytes.size - record.data_offset)
-            kept = data if codec == "none" else decompress_prefix(codec, data, size)
-            self._note("file-cut", chunk.offset, bytes_lost=size - len(kept))
-            return kept
+            readable = data if codec == "none" else decompress_prefix(codec, data, size)
+            self._note("file-cut", chunk.offset, bytes_lost=size - len(readable))
+            return readable
         if record.end > self._bytes.size:
             raise DamageError("file-cut")
         data = self._bytes.read(record.data_offset, record.data_bytes)
@@ -405,6 +405,7 @@ class BagPart(ChunkedPart[_Chunk]):
         self.outline = outline_of(self._bytes.size, self._bytes.read(start, index_bytes)) if self._chunks else ""
 
     def _take_chunk_info(self, record: BagRecord) -> None:
+        """Add a chunk by its summary record, and its messages to the counts of their connections."""
         data = self._bytes.read(record.data_offset, record.data_bytes)
         counts = dict(struct.iter_unpack("<II", data[: len(data) // 8 * 8]))
         if len(data) != 8 * len(counts) or len(counts) != record.number(b"count"):
@@ -436,7 +437,7 @@ class BagPart(ChunkedPart[_Chunk]):
         )
 
     def _walk(self) -> None:
-        """Step from record to record; after one that cannot be, search for the next chunk."""
+        """Read record after record; after an invalid one, continue at the next chunk."""
         position = len(MAGIC)
         while position + 8 <= self._bytes.size:
             try:
@@ -460,7 +461,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return record.end
 
     def _walk_chunk(self, position: int, record: BagRecord) -> None:
-        """Load a chunk for its connections and counts."""
+        """Read the connections and message counts of a chunk."""
         cut = record.end > self._bytes.size
         if cut and self._next_chunk(position + 1) < self._bytes.size:
             raise DamageError("record-damaged")
@@ -478,19 +479,19 @@ class BagPart(ChunkedPart[_Chunk]):
             self._tally(number, len(stamps_ns), min(stamps_ns), max(stamps_ns))
 
     def _next_chunk(self, start: int) -> int:
-        """Return where the next chunk's record begins: the mark of one, inside a header that parses."""
+        """Return the offset of the next chunk's record, found by the mark in its header; the file's size without one."""
         for block_start, _, piece in self._bytes.windows(start, self._bytes.size, _MAX_CHUNK_HEADER):
             block = bytes(piece)
             mark = block.find(_CHUNK_MARK)
             while mark >= 0:
-                found = self._chunk_of_mark(block_start + mark, start)
-                if found is not None:
-                    return found
+                chunk_offset = self._chunk_of_mark(block_start + mark, start)
+                if chunk_offset is not None:
+                    return chunk_offset
                 mark = block.find(_CHUNK_MARK, mark + 1)
         return self._bytes.size
 
     def _chunk_of_mark(self, mark: int, start: int) -> int | None:
-        """Return the first record, at ``start`` or later, of a chunk whose header has the mark at byte ``mark``."""
+        """Return the offset, from ``start`` on, of the chunk whose header has the mark at ``mark``; None without one."""
         first = max(mark - _MAX_CHUNK_HEADER, start)
         try:
             before = bytes(self._bytes.read(first, mark - first))
@@ -505,6 +506,7 @@ class BagPart(ChunkedPart[_Chunk]):
         return None
 
     def _is_chunk(self, position: int) -> bool:
+        """Return whether a valid record of a chunk begins at a position."""
         try:
             length = int.from_bytes(self._bytes.peek(position, 4), "little")
             if not 0 < length <= _MAX_CHUNK_HEADER:
@@ -515,6 +517,7 @@ class BagPart(ChunkedPart[_Chunk]):
             return False
 
     def _record(self, position: int) -> BagRecord:
+        """Read the header of the record at a position; `DamageError` if it is invalid or truncated."""
         head = self._bytes.peek(position, 4)
         length = int.from_bytes(head, "little")
         if len(head) < 4 or length > MAX_HEADER_BYTES:
@@ -533,7 +536,7 @@ class BagPart(ChunkedPart[_Chunk]):
         tally.ends.append(end_ns)
 
     def note_lost(self, chunk: _Chunk, error: DamageError) -> None:
-        """Note the damage of a chunk that is lost as a whole, counted by the bag's index."""
+        """Record the loss of a whole chunk, with the number of messages in the bag's index."""
         lost = sum(chunk.counts.values()) if chunk.counts else None
         self._note(error.cause, chunk.offset, messages_lost=lost, reason=error.reason)
 

@@ -1,8 +1,7 @@
 """Read the chunks of a log of any format, by their index where the chunks agree with it, else record by record.
 
-In a log with cameras most bytes of a chunk are not requested. The requested bytes of several chunks are concatenated
-and parsed together: the fixed cost of a pass is paid once for thousands of messages instead of for
-each chunk.
+In a log with cameras, most bytes of a chunk are not requested. The requested bytes of several chunks are concatenated
+and parsed together, which costs less than a pass for each chunk.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ GROUP_BYTES = 1 << 23
 _GAP_BYTES = 1 << 13  # messages no further apart are copied, or read from the disk, in one piece
 _PLACE_BITS = 40
 MAX_PLANNED_BYTES = (1 << _PLACE_BITS) - 1
-"""A larger chunk is not planned, but read on its own."""
+"""A larger chunk is read on its own."""
 
 Piece = tuple[int, int, int]
 """Start and stop of a part of a chunk, and its position in the concatenation."""
@@ -41,9 +40,9 @@ Piece = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Entries:
-    """Places of messages by the index: chunk number in the group, channel, offset and log time, shape (N,) each.
+    """Index entries of messages: chunk number in the group, channel, offset and log time, shape (N,) each.
 
-    They rise by chunk and offset. ``end`` is where in the chunk the next message begins, or the chunk ends.
+    They are sorted by chunk and offset. ``end`` is the offset of the next message in the chunk, or of the chunk's end.
     """
 
     chunk: Ints
@@ -60,7 +59,7 @@ class Entries:
 
 @dataclass(frozen=True, slots=True)
 class Excerpt:
-    """Pieces of chunks one after another: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,)."""
+    """Concatenated pieces of chunks; ``offset`` is the position in ``data`` of the message of each entry, shape (N,)."""
 
     data: memoryview
     offset: Ints
@@ -80,7 +79,7 @@ class Messages:
     publish_time_ns: Ints
 
     def at(self, chosen: Ints | Mask) -> Messages:
-        """Return the entries of some rows."""
+        """Return the messages of some rows."""
         columns = (self.channel, self.offset, self.payload, self.length, self.log_time_ns, self.publish_time_ns)
         return Messages(self.data, *(values[chosen] for values in columns))
 
@@ -104,7 +103,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
     """A file of chunks, open for reading. Methods raise `DamageError` if a chunk is lost."""
 
     least_bytes: int
-    """No message's record is shorter."""
+    """Smallest size of a message's record [byte]."""
 
     def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
         super().__init__(name)
@@ -130,10 +129,10 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
 
     @abstractmethod
     def read_indexes(self, chunks: list[AnyChunk]) -> tuple[tuple[Ints, ...], Sequence[int]]:
-        """Return the messages of chunks by their indexes, and which chunks have no sound one.
+        """Return the messages that the indexes of chunks list, and the numbers of chunks without a valid index.
 
-        Of each message that is its chunk's number in the list, its channel, offset in the chunk and log time, shape
-        (N,) each.
+        The arrays are the messages' chunk numbers in the list, channels, offsets in the chunk and log times, shape (N,)
+        each.
         """
 
     @abstractmethod
@@ -162,7 +161,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
 
     @abstractmethod
     def note_lost(self, chunk: AnyChunk, error: DamageError) -> None:
-        """Note the damage of a chunk that is lost as a whole, counted by the index."""
+        """Record the loss of a whole chunk, with the number of messages in its index."""
 
     def blocks(self, wanted: frozenset[int]) -> Iterator[MessageBlock]:
         """Yield the messages of the requested channels by chunk, or by several chunks if few messages are wanted."""
@@ -180,13 +179,13 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
         self, entries: Entries, sound: Mask, members: list[tuple[int, AnyChunk]], wanted: frozenset[int]
     ) -> Iterator[MessageBlock]:
         """Yield the requested messages of chunks; losses and contradictions are added to ``damage``."""
-        found = self.read_excerpt(entries, [chunk for _, chunk in members])
-        messages, true = self.read_indexed(found)
-        ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
-        doubtful = np.unique(found.entries.chunk[~true])
+        excerpt = self.read_excerpt(entries, [chunk for _, chunk in members])
+        messages, agrees = self.read_indexed(excerpt)
+        ordinal = np.array([base for base, _ in members], np.int64)[excerpt.entries.chunk] + excerpt.entries.offset
+        doubtful = np.unique(excerpt.entries.chunk[~agrees])
         if len(doubtful):
-            right = ~np.isin(found.entries.chunk, doubtful)
-            messages, ordinal = messages.at(right), ordinal[right]
+            trusted = ~np.isin(excerpt.entries.chunk, doubtful)
+            messages, ordinal = messages.at(trusted), ordinal[trusted]
         yield from self._split_in_time(messages, ordinal)
         for number in np.union1d(doubtful, np.flatnonzero(~sound)).tolist():
             base, chunk = members[number]
@@ -210,11 +209,11 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
             except DamageError as error:
                 lost.append(number)
                 self.note_lost(chunks[number], error)
-        kept = ~np.isin(entries.chunk, lost)
-        return Excerpt(data, offset[kept], entries.at(kept)) if lost else Excerpt(data, offset, entries)
+        is_readable = ~np.isin(entries.chunk, lost)
+        return Excerpt(data, offset[is_readable], entries.at(is_readable)) if lost else Excerpt(data, offset, entries)
 
     def _copy(self, chunk: AnyChunk, pieces: list[Piece], to: memoryview) -> None:
-        """Copy parts of a chunk; read the whole chunk only if it is checked or decompressed."""
+        """Copy pieces of a chunk to their positions in ``to``; load the chunk if it is compressed or has a checksum."""
         start = self.find_plain_data(chunk)
         if start is not None:
             self._bytes.read_pieces([(start + a, to[at : at + b - a]) for a, b, at in pieces])
@@ -224,7 +223,7 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
             to[at : at + b - a] = data[a:b]
 
     def _split_in_time(self, messages: Messages, ordinal: Ints) -> list[MessageBlock]:
-        """Return messages as blocks, without those with a time of more than 63 bits."""
+        """Return messages as one block a channel; exclude and record times of more than 63 bits."""
         valid = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
         if not valid.all():
             self._note("time-invalid", messages_lost=int((~valid).sum()))
@@ -238,23 +237,23 @@ class ChunkedPart(LogPart, Generic[AnyChunk]):
         if entries is None and (chunk.size > MAX_PLANNED_BYTES or not self.needs_index(chunk)):
             return
         if entries is not None:
-            held = messages.at(np.argsort(messages.offset, kind="stable"))
-            from_records = np.stack([held.offset, held.channel, held.log_time_ns])
+            by_offset = messages.at(np.argsort(messages.offset, kind="stable"))
+            from_records = np.stack([by_offset.offset, by_offset.channel, by_offset.log_time_ns])
             if np.array_equal(from_records, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
                 return
-            lost = max(len(entries.offset) - len(held.offset), 0)
+            lost = max(len(entries.offset) - len(by_offset.offset), 0)
         self._note("chunk-index-damaged", chunk.offset, messages_lost=0 if self.is_proved(chunk) else lost or None)
 
 
 def group_chunks(sizes: Iterable[int]) -> Iterator[range]:
-    """Yield which of successive chunks of these sizes [byte] to plan together."""
-    first = last = held = 0
+    """Yield ranges of successive chunks, of given sizes [byte], that are planned together."""
+    first = last = group_bytes = 0
     for size in sizes:
         last += 1
-        held += size
-        if held >= GROUP_BYTES:
+        group_bytes += size
+        if group_bytes >= GROUP_BYTES:
             yield range(first, last)
-            first, held = last, 0
+            first, group_bytes = last, 0
     if first < last:
         yield range(first, last)
 
@@ -262,9 +261,10 @@ def group_chunks(sizes: Iterable[int]) -> Iterator[range]:
 def sort_by_place(
     chunk: Ints, channel: Ints, offset: Ints, log_time_ns: Ints, sizes: Ints, *, least_bytes: int
 ) -> tuple[Entries, Mask]:
-    """Return index entries (shape (N,) each) in their order in chunks of ``sizes`` bytes, and which chunks' are sound.
+    """Return index entries sorted by chunk and offset, shape (N,) each, and which chunks have a valid index.
 
-    Of those that are not, a message would begin outside the chunk, or have less than ``least_bytes`` before the next.
+    An index is invalid if a message begins outside its chunk of ``sizes`` bytes, or has less than ``least_bytes``
+    before the next message.
     """
     outside = (offset < 0) | (offset >= sizes[chunk])
     sound = np.ones(len(sizes), bool)
@@ -280,19 +280,19 @@ def sort_by_place(
 
 
 def lay_out_pieces(entries: Entries) -> tuple[dict[int, list[Piece]], Ints, int]:
-    """Return the order in which the parts of chunks that contain messages are concatenated.
+    """Plan the concatenation of the parts of chunks that contain messages.
 
-    That is the pieces of each chunk by its number; where each message then begins, in the order of the entries; and the
-    bytes in all.
+    Return the pieces of each chunk by its number, the position of each message in the concatenation, shape (N,), and
+    the total size [byte].
     """
     begins = np.ones(len(entries.offset), bool)
     far = entries.offset[1:] - entries.end[:-1] > _GAP_BYTES
     begins[1:] = far | (entries.chunk[1:] != entries.chunk[:-1])
-    at = np.flatnonzero(begins)
-    start, stop = entries.offset[at], entries.end[np.append(at[1:], len(begins)) - 1] if len(at) else at
-    to = np.cumsum(stop - start) - (stop - start)
-    offset = entries.offset + (to - start)[np.cumsum(begins) - 1] if len(at) else entries.offset
+    first = np.flatnonzero(begins)
+    start, stop = entries.offset[first], entries.end[np.append(first[1:], len(begins)) - 1] if len(first) else first
+    target = np.cumsum(stop - start) - (stop - start)
+    offset = entries.offset + (target - start)[np.cumsum(begins) - 1] if len(first) else entries.offset
     pieces: dict[int, list[Piece]] = {}
-    for chunk, *place in zip(*(values.tolist() for values in (entries.chunk[at], start, stop, to)), strict=True):
-        pieces.setdefault(chunk, []).append((place[0], place[1], place[2]))
+    for chunk, *piece in zip(*(values.tolist() for values in (entries.chunk[first], start, stop, target)), strict=True):
+        pieces.setdefault(chunk, []).append((piece[0], piece[1], piece[2]))
     return pieces, offset, int((stop - start).sum())

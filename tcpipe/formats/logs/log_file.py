@@ -44,10 +44,10 @@ from tcpipe.tables.findings import Finding
 _READ_BY_RANGE = (".mcap", ".bag")
 
 BATCH_BYTES = 1 << 25
-"""Memory of a piece of a log, about [byte]."""
+"""Approximate memory of one batch of tables [byte]."""
 
 MAX_TOPICS = 10_000
-"""A log of more topics is refused; a robot has some hundred. A topic costs a millisecond, however small."""
+"""Most topics of a log; a robot has some hundred. Each topic costs a millisecond, however few its messages are."""
 MAX_COLUMNS = 200_000
 """Largest number of columns of topics that are read together; 500 topics of a robot have about 20,000."""
 
@@ -57,8 +57,8 @@ _OTHER_FILES = 256
 _FILE_SYSTEMS_OWN = ("lost+found",)
 
 WANTED = "expected an .mcap, a .bag (2.0), a .db3, a ROS 2 bag directory, a .ulg, ArduPilot's .bin or tables that the recipe maps"
+# First bytes of the logs of autopilots; a DataFlash log begins with the format of its formats.
 _AUTOPILOTS: dict[bytes, AutopilotKind] = {b"ULog\x01\x12\x35": "ulog", b"\xa3\x95\x80\x80\x59": "dataflash"}
-"""How their logs begin; DataFlash's with the format of formats."""
 _KNOWN_MAGIC = (
     (b"PK\x03\x04", "a zip archive"),
     (b"\x1f\x8b", "a gzip file"),
@@ -75,16 +75,16 @@ _KNOWN_MAGIC = (
 def open_log(path: Location, *, message_definitions: Path | None = None) -> Log:
     """Open a .mcap, .bag or .db3 file (by its content), or a ROS 2 bag directory; `LogError` names any other kind.
 
-    ``path`` may be the URL of one (``s3://…``): of an .mcap or .bag with an index only the requested topics are
-    fetched, any other is copied until the log is closed. ``message_definitions``: a directory of .msg files for types
-    that the log does not define.
+    ``path`` may be a URL (``s3://…``): tcpipe fetches only the requested topics of an .mcap or .bag with an index, and
+    copies any other log until it is closed. ``message_definitions`` is a directory of .msg files for types that the log
+    does not define.
     """
     with ExitStack() as stack:
         stored: dict[Path, StoredObject] = {}
         if is_url(path):
             path, stored = stack.enter_context(lay_out_objects(str(path), wanted=is_log_file, by_range=_READ_BY_RANGE))
         path = Path(path)
-        _refuse_what_is_not_there(path)
+        _require_existing_path(path)
         if not path.is_file() and not path.is_dir():
             raise LogError(f"{path}: it is a pipe or a device; {WANTED}")
         fetched = {file: FetchedFile(place, file) for file, place in stored.items()}
@@ -97,7 +97,7 @@ def open_log(path: Location, *, message_definitions: Path | None = None) -> Log:
 
 def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | None) -> LogPart:
     """Open a file of a log until the stack ends; `LogError` names the probable kind of any other file."""
-    magic, given = _read_magic(path, fetched), path
+    magic, original = _read_magic(path, fetched), path
     if fetched is not None and not magic.startswith((mcap_records.MAGIC, bag_file.MAGIC)):
         fetched.whole()
     if magic.startswith(ZSTD_MAGIC):
@@ -111,13 +111,13 @@ def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | No
     elif magic.startswith(sqlite_file.MAGIC):
         part = SqlitePart(path, name)
     else:
-        held = "" if path == given else "what it holds, decompressed: "
+        prefix = "" if path == original else "what it holds, decompressed: "
         wanted = (
-            f"a table needs a recipe (--recipe FILE); tcpipe init --from {quote(str(given))} writes one"
-            if is_table(given.name)
+            f"a table needs a recipe (--recipe FILE); tcpipe init --from {quote(str(original))} writes one"
+            if is_table(original.name)
             else WANTED
         )
-        raise LogError(f"{given}: not a log: {held}{_describe_other_file(path, magic)}; {wanted}")
+        raise LogError(f"{original}: not a log: {prefix}{_describe_other_file(path, magic)}; {wanted}")
     stack.callback(part.close)
     return part
 
@@ -129,6 +129,7 @@ def find_autopilot(path: Path) -> AutopilotKind | None:
 
 
 def _read_magic(path: Path, fetched: FetchedFile | None) -> bytes:
+    """Return the first bytes of a file, which identify its format."""
     if fetched is not None and not fetched.is_whole:
         return fetched.read(0, 16)
     try:
@@ -162,7 +163,7 @@ def _describe_other_file(path: Path, magic: bytes) -> str:
     return f"it is {path.stat().st_size} bytes that begin with {magic[:8]!r}"
 
 
-def _refuse_what_is_not_there(path: Path) -> None:
+def _require_existing_path(path: Path) -> None:
     if path.is_symlink() and not path.exists():
         raise LogError(f"{path}: is a link to {path.readlink()}, which is not there")
     if not path.exists():
@@ -170,9 +171,9 @@ def _refuse_what_is_not_there(path: Path) -> None:
 
 
 def find_logs(path: Path) -> list[Path]:
-    """Return logs at or below a path by name, without hidden files, and unreadable directories. `LogError`: none."""
+    """Return the logs at or below a path, and unreadable directories, by name; `LogError` without any."""
     path = Path(path)
-    _refuse_what_is_not_there(path)
+    _require_existing_path(path)
     if not path.is_dir():
         return [path]
     found = list_logs_below(path)
@@ -182,7 +183,7 @@ def find_logs(path: Path) -> list[Path]:
 
 
 def list_logs_below(directory: Path) -> list[Path]:
-    """Return the logs in a directory as `find_logs` does, perhaps none; linked directories are read once."""
+    """Return the logs below a directory, as `find_logs`, or []; linked directories are searched once."""
     found, seen, waiting = list[Path](), set[tuple[int, int]](), [(directory, True)]
     while waiting:
         path, is_directory = waiting.pop()
@@ -243,8 +244,8 @@ class OpenLog:
     @property
     def size_and_time(self) -> list[list[int]]:
         """Size [byte] and modification time [ns] of each file, by name: equal for an unchanged log."""
-        found = [file.stat() for file in sorted(self.files, key=lambda file: file.name)]
-        return [[stat.st_size, stat.st_mtime_ns] for stat in found]
+        states = [file.stat() for file in sorted(self.files, key=lambda file: file.name)]
+        return [[stat.st_size, stat.st_mtime_ns] for stat in states]
 
 
 class Log(OpenLog):
@@ -271,9 +272,9 @@ class Log(OpenLog):
 
     def _compare_counts(self, listed: Rosbag2Files) -> None:
         """Record that metadata.yaml counts more messages than the files contain, in total or of a topic."""
-        held = {name: topic.message_count or 0 for name, topic in self.topics.items()}
-        of_topics = sum(max(count - held.get(name, 0), 0) for name, count in listed.topic_counts.items())
-        lost = max((listed.message_count or 0) - sum(held.values()), of_topics)
+        counts = {name: topic.message_count or 0 for name, topic in self.topics.items()}
+        of_topics = sum(max(count - counts.get(name, 0), 0) for name, count in listed.topic_counts.items())
+        lost = max((listed.message_count or 0) - sum(counts.values()), of_topics)
         if lost > 0:
             self._damage.append(Damage("messages-miscounted", self.path.name, messages_lost=lost))
 
@@ -304,8 +305,8 @@ class Log(OpenLog):
     def sha256(self) -> str:
         """Return the SHA-256 of the file; of a bag directory, of its storage files one after the other, by name.
 
-        Of a log in object storage that is read by its index it is that of the index, the `outline`. `LogError`: the
-        disk fails.
+        For a log in object storage that is read by its index, return the hash of the index (`outline`). `LogError`:
+        the disk fails.
         """
         if self.is_known_by_outline:
             return self.outline
@@ -346,7 +347,7 @@ class Log(OpenLog):
         return tables
 
     def first_rows(self, topics: Iterable[str]) -> dict[str, pa.Table]:
-        """Return the first rows of several topics, as `tables`; the log is read until each has some."""
+        """Return the first rows of several topics, as `tables` does; read the log until each topic has rows."""
         found: dict[str, pa.Table] = {}
         wanted = [name for name in topics if self.topics[name].message_count != 0]
         if wanted:
@@ -357,36 +358,38 @@ class Log(OpenLog):
         return found
 
     def batches(self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES) -> Iterator[dict[str, pa.Table]]:
-        """Yield the tables of several topics piece by piece, as `tables`, in memory that does not grow with the log.
+        """Yield the tables of several topics in batches, as `tables`, in memory that does not grow with the log.
 
-        Each dict has the next rows of some topics (those with most rows); the last one names every topic. Rows are in
-        the order of log time, also from piece to piece, unless a message is in the log more than half a piece behind
-        its time; `findings` counts those. A piece is yielded when more than ``batch_bytes`` are gathered over all
-        topics; None yields everything at once.
+        Each batch has the next rows of the topics with most data; the last one names every topic. Rows are in the order
+        of log time, also across batches, unless a message comes more than half a batch after its time; `findings`
+        counts such messages. A batch is yielded when more than ``batch_bytes`` are gathered over all topics; None
+        yields one batch.
         """
         collected = self._collectors(topics)
-        most = math.inf if batch_bytes is None else batch_bytes
-        given = dict.fromkeys(collected, 0)
-        held, size = 0, self.size_bytes
+        limit_bytes = math.inf if batch_bytes is None else batch_bytes
+        yielded_rows = dict.fromkeys(collected, 0)
+        gathered, size = 0, self.size_bytes
         meter, messages = Meter("reading", size), sum(self.topics[name].message_count or 0 for name in collected)
         for index in range(len(self._parts)):
             for topic_table, block in self._blocks(index, collected):
                 meter.add(size * len(block.offsets) / max(messages, 1))
-                held -= topic_table.held_bytes
+                gathered -= topic_table.held_bytes
                 topic_table.add(block)
-                held += topic_table.held_bytes
-                if held > most:
+                gathered += topic_table.held_bytes
+                if gathered > limit_bytes:
                     fullest = {
-                        name: table for name, table in collected.items() if table.held_bytes * len(collected) >= held
+                        name: table
+                        for name, table in collected.items()
+                        if table.held_bytes * len(collected) >= gathered
                     }
                     tables = {name: table.take(share=0.5) for name, table in fullest.items()}
                     for name, table in tables.items():
-                        given[name] += table.num_rows
+                        yielded_rows[name] += table.num_rows
                     yield tables
-                    held = sum(table.held_bytes for table in collected.values())
+                    gathered = sum(table.held_bytes for table in collected.values())
         tables = {name: table.take() for name, table in collected.items()}
         for name, collected_table in collected.items():
-            self._note_losses(name, collected_table, given[name] + tables[name].num_rows)
+            self._note_losses(name, collected_table, yielded_rows[name] + tables[name].num_rows)
         yield tables
 
     def _collectors(self, topics: Iterable[str]) -> dict[str, TopicTable]:
@@ -398,12 +401,12 @@ class Log(OpenLog):
             raise LogError(*(f"{self.path}: there is no topic {name}; it has {known_topics}" for name in unknown))
         types, columns = dict[str, MessageType](), 0
         for name in wanted:
-            found = self._message_type(name)
-            if isinstance(found, DefinitionError):
-                self._note_undecoded(self.path.name, name, self.topics[name].message_count, str(found))
+            resolved = self._message_type(name)
+            if isinstance(resolved, DefinitionError):
+                self._note_undecoded(self.path.name, name, self.topics[name].message_count, str(resolved))
                 continue
-            types[name] = found
-            columns += found.wire.leaves
+            types[name] = resolved
+            columns += resolved.wire.leaves
             if columns > MAX_COLUMNS:
                 raise LogError(
                     f"{self.path}: its topics expand to more than {MAX_COLUMNS} columns; read fewer of them at once"
@@ -411,7 +414,7 @@ class Log(OpenLog):
         return {name: TopicTable(message_type, self.topics[name].encoding) for name, message_type in types.items()}
 
     def _blocks(self, index: int, collected: Mapping[str, TopicTable]) -> Iterator[tuple[TopicTable, MessageBlock]]:
-        """Yield one file's blocks, each with its topic's table, without channels of another type than their topic's."""
+        """Yield a file's blocks with their topics' tables; skip channels whose type differs from their topic's."""
         part, channels = self._parts[index], {}
         for number, channel in part.channels.items():
             if channel.name in collected:
@@ -426,6 +429,7 @@ class Log(OpenLog):
                 yield channels[block.channel], later
 
     def _agrees(self, channel: Topic) -> bool:
+        """Return whether a channel has the type, encoding and fields of its topic."""
         topic = self.topics[channel.name]
         if (channel.type_name, channel.encoding) != (topic.type_name, topic.encoding):
             return False
@@ -459,6 +463,7 @@ class Log(OpenLog):
         return str(found) if isinstance(found, DefinitionError) else None
 
     def _note_losses(self, name: str, topic_table: TopicTable, rows: int) -> None:
+        """Record missing, undecodable and late messages, and invalid texts, of a topic."""
         missing = (self.topics[name].message_count or 0) - rows - topic_table.undecodable
         if missing and not self._damage and not any(part.damage for part in self._parts):
             lost = missing if missing > 0 else None  # messages too many may be another topic's
@@ -493,16 +498,16 @@ def _open_directory(
 ) -> tuple[Rosbag2Files, list[LogPart]]:
     """Open the files of a ROS 2 bag; files that cannot be opened are recorded as damage."""
     try:
-        found = find_rosbag2_files(directory)
+        bag_files = find_rosbag2_files(directory)
     except LogError as error:
         below = [str(path) for path in list_logs_below(directory) if path.parent != directory]
         if not below:
             raise
         names = ", ".join(below[:_LISTED]) + (" and more" if len(below) > _LISTED else "")
         raise LogError(*error.problems, f"{directory}: contains several logs, give one of them: {names}") from None
-    _allow_files(len(found.paths))
-    parts, damage, errors = [], list(found.damage), []
-    for file in found.paths:
+    _allow_files(len(bag_files.paths))
+    parts, damage, errors = [], list(bag_files.damage), []
+    for file in bag_files.paths:
         try:
             parts.append(open_part(file, f"{directory.name}/{file.name}", stack, fetched.get(file)))
         except LogError as error:
@@ -510,7 +515,7 @@ def _open_directory(
             damage.append(Damage("data-unreadable", f"{directory.name}/{file.name}", reason=str(error)))
     if not parts:
         raise LogError(*(problem for error in errors for problem in error.problems))
-    return replace(found, damage=tuple(damage)), parts
+    return replace(bag_files, damage=tuple(damage)), parts
 
 
 def _allow_files(count: int) -> None:
@@ -523,16 +528,16 @@ def _allow_files(count: int) -> None:
 
 
 def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
-    """Return possible logs in a directory, and whether each is a directory to search; a bag directory gives itself."""
+    """Return possible logs in a directory, each with whether it is a directory to search; or a bag directory itself."""
     with os.scandir(directory) as there:
         entries = sorted(there, key=lambda entry: entry.name)
     one_bag = is_one_bag(directory)
-    found = [(directory, False)] if one_bag else []
+    candidates = [(directory, False)] if one_bag else []
     for entry in entries:
         if entry.name.startswith((".", "~")) or entry.name in _FILE_SYSTEMS_OWN:
             continue
         if os.path.isdir(entry):  # noqa: PTH112  False where it cannot be read
-            found.append((directory / entry.name, True))
+            candidates.append((directory / entry.name, True))
         elif one_bag and entry.name.endswith(STORAGE_SUFFIXES):
             continue
         elif (
@@ -540,8 +545,8 @@ def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
             and (entry.is_symlink() or entry.is_file())
             and not (entry.name.lower().endswith(".bin") and _is_other_binary(directory / entry.name))
         ):
-            found.append((directory / entry.name, False))
-    return found
+            candidates.append((directory / entry.name, False))
+    return candidates
 
 
 def _is_other_binary(path: Path) -> bool:

@@ -66,13 +66,13 @@ class JoinedLog(OpenLog):
         """Size and hash of each log, in order. `LogError`: two logs are the same recording."""
         digests: dict[str, Log | TableLog] = {}
         for log in self._logs:
-            twin = digests.setdefault(log.sha256(), log)
-            if twin is not log:
-                raise LogError(f"{log.path}: the same recording as {twin.path}; give each part once")
+            duplicate = digests.setdefault(log.sha256(), log)
+            if duplicate is not log:
+                raise LogError(f"{log.path}: the same recording as {duplicate.path}; give each part once")
         return tuple(Checksum(log.size_bytes, sha256) for sha256, log in digests.items())
 
     def sha256(self) -> str:
-        """Return the hash of the log; of several, that of their hashes, in order."""
+        """Return the hash of a single log, or the hash of the hashes of several logs, in order."""
         return join_hashes([part.sha256 for part in self.parts])
 
     def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
@@ -91,9 +91,9 @@ class JoinedLog(OpenLog):
                 for name, table in tables.items():
                     _require_same_fields(name, schemas.setdefault(name, table.schema), table.schema)
                 yield tables
-        lent = [topic for topic in topics if not any(topic in log.topics for log in self._logs)]
-        if self._earlier and lent:
-            yield from self._earlier.batches(lent)
+        borrowed = [topic for topic in topics if not any(topic in log.topics for log in self._logs)]
+        if self._earlier and borrowed:
+            yield from self._earlier.batches(borrowed)
 
 
 def _require_same_fields(topic: str, first: pa.Schema, other: pa.Schema) -> None:
@@ -134,15 +134,15 @@ def open_logs(
 def open_single_log(
     path: Location, *, message_definitions: Path | None = None, tables: Mappings | None = None
 ) -> Log | TableLog:
-    """Open a log of an autopilot; a folder that is no bag, or a table, by ``tables``; or as `open_log`."""
+    """Open an autopilot log, a table or folder of tables that ``tables`` maps, or a log that `open_log` reads."""
     with ExitStack() as stack:
-        here, name = path, format_path(path)
+        local_path, name = path, format_path(path)
         if is_url(path) and name.lower().endswith(AUTOPILOT_SUFFIXES):
-            here, _ = stack.enter_context(lay_out_objects(str(path), wanted=is_log_file, by_range=()))
-        if not is_url(here) and (kind := find_autopilot(Path(here))):
+            local_path, _ = stack.enter_context(lay_out_objects(str(path), wanted=is_log_file, by_range=()))
+        if not is_url(local_path) and (kind := find_autopilot(Path(local_path))):
             from tcpipe.formats.logs.autopilot_log import open_autopilot_log  # noqa: PLC0415  only where one is read
 
-            return open_autopilot_log(Path(here), kind, stack.pop_all())
+            return open_autopilot_log(Path(local_path), kind, stack.pop_all())
     if tables and isinstance(path, Path):
         run = find_table_run(path, tables) if path.is_file() else None
         if run or (path.is_dir() and not is_one_bag(path)):
@@ -158,7 +158,7 @@ def open_single_log(
 
 
 def _find_earlier_part(log: Log) -> Log | None:
-    """Return the nearest earlier part that has static transforms, open; None if the chain of parts breaks before."""
+    """Return the nearest earlier part that has static transforms, open; None if a part between is missing."""
     part: Log | None = log
     while part is not None:
         before = _find_part_before(part)
@@ -172,39 +172,40 @@ def _find_earlier_part(log: Log) -> Log | None:
 
 def _find_part_before(log: Log) -> Log | None:
     """Return the part of the same recording that ends where this one begins, open."""
-    mine = _PART.fullmatch(log.path.name)
+    own_name = _PART.fullmatch(log.path.name)
     starts = [topic.start_ns for topic in log.topics.values() if topic.start_ns is not None]
-    if mine is None or not starts or log.path.is_dir():
+    if own_name is None or not starts or log.path.is_dir():
         return None
     for path in sorted(log.path.parent.iterdir()):
-        other = _PART.fullmatch(path.name)
+        other_name = _PART.fullmatch(path.name)
         if (
-            other
-            and int(other["number"]) == int(mine["number"]) - 1
-            and _DATE.sub("", other["name"]) == _DATE.sub("", mine["name"])
+            other_name
+            and int(other_name["number"]) == int(own_name["number"]) - 1
+            and _DATE.sub("", other_name["name"]) == _DATE.sub("", own_name["name"])
         ):
             try:
-                found = open_log(path)
+                candidate = open_log(path)
             except (LogError, OSError):
                 continue
-            ends = [topic.end_ns for topic in found.topics.values() if topic.end_ns is not None]
+            ends = [topic.end_ns for topic in candidate.topics.values() if topic.end_ns is not None]
             if ends and abs(min(starts) - max(ends)) <= _GAP_NS:
-                return found
-            found.close()
+                return candidate
+            candidate.close()
     return None
 
 
 def _merge_topics(logs: Sequence[Log | TableLog]) -> dict[str, Topic]:
+    """Return the topics of all logs by name; `LogError` if a topic has different types."""
     merged: dict[str, Topic] = {}
     for log in logs:
         for name, topic in log.topics.items():
-            before = merged.get(name)
-            if before is not None and before.type_name != topic.type_name:
+            earlier = merged.get(name)
+            if earlier is not None and earlier.type_name != topic.type_name:
                 raise LogError(
-                    f"{log.path}: topic {name} is {topic.type_name} here and {before.type_name} in another of the files "
+                    f"{log.path}: topic {name} is {topic.type_name} here and {earlier.type_name} in another of the files "
                     f"given with --as-one; ingest them apart"
                 )
-            merged[name] = topic if before is None else before.joined(topic)
+            merged[name] = topic if earlier is None else earlier.joined(topic)
     return merged
 
 

@@ -23,24 +23,24 @@ from tcpipe.logs.topics import Damage, Topic
 
 MAX_CHUNK_BYTES = 1 << 29
 """Largest plausible content of a chunk, which is held as a whole [byte]; writers make chunks of some megabytes."""
+# Limits of decompressed data: size [byte] and ratio to the compressed size. Data that claim to exceed both are
+# damaged (a bomb). The limit of a chunk or message is lower than that of a file, because it is in memory as a
+# whole, and more than once while it is decoded.
 _PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO, _PLAUSIBLE_CHUNK_RATIO = 1 << 26, 1000, 100
-"""Limits of decompressed data: size [byte] and ratio to the compressed size. Data that claim to exceed both are damaged
-(a bomb). The limit of a chunk or message is lower than that of a file, because it is in memory as a whole, and more
-than once while it is decoded."""
 MAX_CHUNKS = 1 << 20
-"""A file of more chunks is refused: of chunks of a megabyte, as writers make them, this is a terabyte."""
+"""Most chunks of a file; with the usual chunks of a megabyte, this is a terabyte."""
 MAX_CHANNELS = 1 << 16
-"""More channels or connections of a file are refused: MCAP cannot number more."""
+"""Most channels or connections of a file: MCAP cannot number more."""
+# Most records of a file, and fewest bytes per record: with more records, tcpipe rejects the file.
 _FEW_RECORDS, _LEAST_RECORD_BYTES = 1 << 20, 4
-"""Most records of a file, and fewest bytes per record: with more records, tcpipe rejects the file."""
 _PLAUSIBLE_TOTAL = 1 << 30
 _SEARCH_BYTES = 1 << 20
 
 _PEEK_BYTES = 1 << 13
 
 _BLOCK_BYTES = 1 << 13  # fetched ranges begin and end at multiples of this [byte]
+# Size of the buffer of fetched ranges [byte]: larger than a group of chunks that is planned together.
 _HELD_BLOCKS = (1 << 26) // _BLOCK_BYTES
-"""Size of the buffer of fetched ranges [byte]: larger than a group of chunks that is planned together."""
 _GAP_BLOCKS = 4  # blocks no further apart are fetched as one piece: a request costs as much as some
 
 
@@ -74,7 +74,7 @@ def group_by_key(keys: Ints) -> Iterator[tuple[int, Ints]]:
 
 
 def split_by_channel(buffer: memoryview, channel: Ints, *columns: Ints) -> list[MessageBlock]:
-    """Return messages in one buffer as one block a channel; the other columns are those of a block, in its order."""
+    """Return messages in one buffer as one block a channel; ``columns`` are the other fields of a block, in order."""
     return [MessageBlock(number, buffer, *(values[at] for values in columns)) for number, at in group_by_key(channel)]
 
 
@@ -130,12 +130,12 @@ class FetchedFile:
         if offset >= stop:
             return b""
         blocks = range(offset // _BLOCK_BYTES, -(-stop // _BLOCK_BYTES))
-        found = self._blocks(blocks)
+        block_by_number = self._blocks(blocks)
         first = offset - blocks.start * _BLOCK_BYTES
-        return b"".join(found[number] for number in blocks)[first : first + stop - offset]
+        return b"".join(block_by_number[number] for number in blocks)[first : first + stop - offset]
 
     def expect(self, pieces: Iterable[tuple[int, int]]) -> None:
-        """Fetch pieces (offset, size) that are read soon, side by side."""
+        """Fetch pieces (offset, size) that will be read soon, in parallel."""
         most = -(-self._stored.size_bytes // _BLOCK_BYTES)
         wanted = {
             number
@@ -152,26 +152,26 @@ class FetchedFile:
             self._held.clear()
 
     def _blocks(self, numbers: Collection[int]) -> dict[int, memoryview]:
-        """Return blocks by number, and fetch missing ones."""
-        found = {number: self._held[number] for number in numbers if number in self._held}
-        for number in found:
+        """Return blocks by number; fetch missing ones."""
+        blocks = {number: self._held[number] for number in numbers if number in self._held}
+        for number in blocks:
             self._held.move_to_end(number)
-        runs = _find_runs(sorted(set(numbers) - found.keys()))
+        runs = _find_runs(sorted(set(numbers) - blocks.keys()))
         size = self._stored.size_bytes
         spans = [(run.start * _BLOCK_BYTES, min(run.stop * _BLOCK_BYTES, size)) for run in runs]
         for run, data in zip(runs, self._stored.ranges(spans) if spans else (), strict=True):
-            found |= {
+            blocks |= {
                 number: data[(number - run.start) * _BLOCK_BYTES : (number + 1 - run.start) * _BLOCK_BYTES]
                 for number in run
             }
-        self._held.update(found)
+        self._held.update(blocks)
         while len(self._held) > _HELD_BLOCKS:
             self._held.popitem(last=False)
-        return found
+        return blocks
 
 
 def _find_runs(numbers: Sequence[int]) -> list[range]:
-    """Return rising numbers as runs, short gaps filled."""
+    """Return ranges that contain all of the sorted block numbers; ranges with a short gap between them are joined."""
     runs: list[range] = []
     for number in numbers:
         if runs and number - runs[-1].stop <= _GAP_BLOCKS:
@@ -218,10 +218,10 @@ class ByteSource:
         return held[offset - at : offset - at + size]
 
     def windows(self, start: int, end: int, overlap: int) -> Iterator[tuple[int, int, memoryview]]:
-        """Yield (start, size to search, bytes) of pieces to search one after the other; unreadable bytes are left out.
+        """Yield (start, size, bytes) of windows to search; bytes reach ``overlap`` further; skip unreadable windows.
 
-        The first are small: a search that succeeds soon stays cheap, however many there are in a file that is made to
-        need them.
+        Windows double in size from a small first one: an early match is cheap, also in a file that is made to need many
+        searches.
         """
         size = 1 << 12
         while start < end:
@@ -235,7 +235,7 @@ class ByteSource:
         os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
 
     def expect(self, pieces: Sequence[tuple[int, int]]) -> None:
-        """Have pieces (offset, size) brought here, which are read soon."""
+        """Request pieces (offset, size) that will be read soon."""
         if self._fetched is not None and not self._fetched.is_whole:
             self._fetched.expect(pieces)
             return
@@ -243,7 +243,7 @@ class ByteSource:
             os.posix_fadvise(self._file.fileno(), offset, size, os.POSIX_FADV_WILLNEED)
 
     def whole(self) -> None:
-        """Have all of the file here: it is read from its beginning to its end."""
+        """Fetch the whole file, which is read from its beginning to its end."""
         if self._fetched is not None:
             self._fetched.whole()
 
@@ -269,7 +269,7 @@ def outline_of(size: int, index: bytes | memoryview) -> str:
 
 
 def join_hashes(hashes: Sequence[str]) -> str:
-    """Return the hash (hex) of several parts by those of each, in order; of one part its own."""
+    """Return one hash (hex) of the hashes of several parts, in order; a single part's hash as it is."""
     return hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
 
 
@@ -280,7 +280,7 @@ def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:
 
 
 class Bounds:
-    """Limit of a file's content by its size [byte]: `LogError` above it, since it would exhaust memory or time."""
+    """Limits of the content of a file of some size [byte]; `LogError` above them, before memory or time run out."""
 
     def __init__(self, path: Path, size: int) -> None:
         self._path, self._size = path, size
@@ -325,13 +325,13 @@ def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False
         if codec == "zstd" or (codec == "lz4" and checked):
             return memoryview(pa.decompress(pa.py_buffer(data), size, codec=codec)).cast("B")
         with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
-            found = stream.read_buffer(size)
-            more = stream.read(1)  # also brings the reading to the end, where checksums are compared
+            content = stream.read_buffer(size)
+            more = stream.read(1)  # reads to the end, where checksums are compared
     except OSError:
         raise DamageError("chunk-damaged") from None
-    if len(found) != size or more:
+    if len(content) != size or more:
         raise DamageError("chunk-damaged")
-    return memoryview(found).cast("B")
+    return memoryview(content).cast("B")
 
 
 def _refuse_unknown(codec: str) -> None:
@@ -340,16 +340,16 @@ def _refuse_unknown(codec: str) -> None:
 
 
 def decompress_prefix(codec: str, data: memoryview, size: int) -> memoryview:
-    """Return as many of the ``size`` bytes as the cut ``data`` still gives."""
+    """Return the first of ``size`` bytes, as far as the truncated ``data`` can be decompressed."""
     _refuse_unknown(codec)
-    found = bytearray()
+    content = bytearray()
     try:
         with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
-            while len(found) < min(size, MAX_CHUNK_BYTES) and (piece := stream.read(4096)):
-                found += piece
+            while len(content) < min(size, MAX_CHUNK_BYTES) and (piece := stream.read(4096)):
+                content += piece
     except OSError:  # the cut is reached
         pass
-    return memoryview(found)[:size]
+    return memoryview(content)[:size]
 
 
 def gather_integers(buffer: bytes | memoryview, offsets: Ints, code: str) -> Ints:

@@ -1,7 +1,7 @@
 """Read MCAP files by their summary if it is valid, else record by record; damaged parts are skipped.
 
-A chunk is decompressed only if it contains a requested channel, its CRC is checked, and the message index beside it
-(which no checksum covers) is believed only as far as the chunk's own records bear it out.
+tcpipe decompresses only chunks with a requested channel, checks their CRC, and compares the message index, which no
+checksum covers, with the records of the chunk.
 """
 
 from collections.abc import Iterator, Sequence
@@ -60,6 +60,7 @@ class McapPart(ChunkedPart[Chunk]):
     least_bytes = RECORD_HEAD + MESSAGE_HEAD
 
     def _open(self) -> dict[int, Topic]:
+        """Read the summary, or every record if the summary cannot be used; return the topic of each channel."""
         self._tallies: dict[int, tuple[int, int, int]] = {}
         """By channel: number of messages found by reading records, first and last log time."""
         self._untimed = 0
@@ -93,41 +94,42 @@ class McapPart(ChunkedPart[Chunk]):
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
         """Return the chunks that may contain requested channels, each with the number of bytes before it."""
-        base, found = 0, []
+        base, selected = 0, []
         for chunk in self._contents.chunks:
             if chunk.index is None or not wanted.isdisjoint(chunk.index):
-                found.append((base, chunk))
+                selected.append((base, chunk))
             base += min(chunk.size, MAX_CHUNK_BYTES)
-        if len(found) < len(self._contents.chunks):
+        if len(selected) < len(self._contents.chunks):
             self._bytes.skips()
-        return found
+        return selected
 
     def read_indexed(self, found: Excerpt) -> tuple[Messages, Mask]:
         """Return the messages of an excerpt, and which of them agree with the chunk's index."""
-        messages, right = read_messages_at(found.data, found.offset)
+        messages, is_message = read_messages_at(found.data, found.offset)
         entries = found.entries
-        room = entries.end - entries.offset - RECORD_HEAD - MESSAGE_HEAD
-        same = (messages.channel == entries.channel) & (messages.log_time_ns == entries.log_time_ns)
-        return messages, right & same & (messages.length <= room)
+        available_bytes = entries.end - entries.offset - RECORD_HEAD - MESSAGE_HEAD
+        agrees = (messages.channel == entries.channel) & (messages.log_time_ns == entries.log_time_ns)
+        return messages, is_message & agrees & (messages.length <= available_bytes)
 
     def _step_through(self, chunk: Chunk, data: memoryview) -> tuple[Ints, int]:
-        """Return start and end of the records of a chunk."""
+        """Return the offsets of a chunk's records, shape (N,), and the end of the last one."""
         records, end = record_offsets(data, self._bounds.most_records)
         self._bounds.walk(chunk.offset, len(records))
         return records, end
 
     def read_walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int]) -> Messages:
-        """Return the wanted messages of a chunk by its records; note damage if these end too early or are invalid."""
+        """Return the requested messages of a chunk from its records; record damage of invalid or missing records."""
         records, end = self._step_through(chunk, data)
         messages, _ = read_messages_at(data, find_message_offsets(data, records))
-        every = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
-        if lost := every - len(messages.offset):
+        message_count = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
+        if lost := message_count - len(messages.offset):
             self._note("time-invalid", chunk.offset, messages_lost=lost)
         if end < len(data) and not chunk.cut:
             self._note("record-damaged", chunk.offset, bytes_lost=len(data) - end)
         unknown = [n for n in np.unique(messages.channel).tolist() if n not in self._contents.channels]
-        counted = chunk.headless or (chunk.index is None and not self._contents.statistics)  # when the file was opened
-        if unknown and not counted:
+        # These messages were counted when the file was opened.
+        is_counted = chunk.headless or (chunk.index is None and not self._contents.statistics)
+        if unknown and not is_counted:
             lost = int(np.isin(messages.channel, unknown).sum())
             self._note("channel-undeclared", chunk.offset, messages_lost=lost)
         return messages.at(np.isin(messages.channel, sorted(wanted)))
@@ -141,7 +143,7 @@ class McapPart(ChunkedPart[Chunk]):
         return chunk.index is not None and not chunk.cut and not self._crc(chunk)
 
     def find_plain_data(self, chunk: Chunk) -> int | None:
-        """Return where the records of a chunk begin that is neither compressed nor has a CRC."""
+        """Return the file offset of the records of a chunk that is not compressed and has no CRC, else None."""
         if chunk.compression or self._crc(chunk):
             return None
         self.is_unchecked = True
@@ -154,14 +156,14 @@ class McapPart(ChunkedPart[Chunk]):
         return int.from_bytes(self._bytes.read(chunk.offset + CHUNK_CRC, 4), "little")
 
     def load(self, chunk: Chunk) -> memoryview:
-        """Return the chunk's records, its CRC checked."""
+        """Return the chunk's records after a check of their CRC."""
         crc = self._crc(chunk)
         self.is_unchecked |= not crc
         data, size = self._bytes.read(chunk.data_offset, chunk.data_bytes), chunk.uncompressed_bytes
         if chunk.cut:
-            kept = decompress_prefix(chunk.compression, data, size) if chunk.compression else data
-            self._note("file-cut", chunk.offset, bytes_lost=size - len(kept))
-            return kept
+            readable = decompress_prefix(chunk.compression, data, size) if chunk.compression else data
+            self._note("file-cut", chunk.offset, bytes_lost=size - len(readable))
+            return readable
         if chunk.compression:
             data = decompress(chunk.compression, data, size, checked=bool(crc))
         if crc and crc32(data) != crc:
@@ -169,37 +171,35 @@ class McapPart(ChunkedPart[Chunk]):
         return data
 
     def read_indexes(self, chunks: list[Chunk]) -> tuple[tuple[Ints, ...], Sequence[int]]:
-        """Return the messages of several chunks by their indexes."""
+        """Return the messages that message indexes list, and the numbers of chunks without a valid index."""
         regions: list[memoryview] = []
-        places: list[tuple[int, int, int, int]] = []
-        unsound, before = [], 0
-        starts = [(c.offset if c.compression else c.end, c) for c in chunks if c.index is not None]
-        self._bytes.expect(
-            [(start, c.end + c.index_bytes - start) for start, c in starts]
-        )  # a plain chunk: indexes first
+        indexes: list[tuple[int, int, int, int]] = []
+        invalid, region_start = [], 0
+        starts = [(c.offset if c.compression else c.end, c) for c in chunks if c.index is not None]  # plain: index only
+        self._bytes.expect([(start, c.end + c.index_bytes - start) for start, c in starts])
         for number, chunk in enumerate(chunks):
             if chunk.index is None or chunk.cut or chunk.size > MAX_PLANNED_BYTES:
-                unsound.append(number)
+                invalid.append(number)
                 continue
             try:
                 region, records = self._index_region(chunk, chunk.index)
             except DamageError:
-                unsound.append(number)
+                invalid.append(number)
                 continue
-            end = before + len(region)
-            places += [(number, channel, before + at, end) for channel, at in records]
+            end = region_start + len(region)
+            indexes += [(number, channel, region_start + at, end) for channel, at in records]
             regions.append(region)
-            before = end
-        chunk_number, channels, at, ends = np.array(places, np.int64).reshape(-1, 4).T
-        right, record, stamps, offsets = index_messages(b"".join(regions), at, ends, channels)
-        return (chunk_number[record], channels[record], offsets, stamps), [*unsound, *chunk_number[~right].tolist()]
+            region_start = end
+        chunk_number, channels, at, ends = np.array(indexes, np.int64).reshape(-1, 4).T
+        is_valid, record, stamps, offsets = index_messages(b"".join(regions), at, ends, channels)
+        return (chunk_number[record], channels[record], offsets, stamps), [*invalid, *chunk_number[~is_valid].tolist()]
 
     def _index_region(self, chunk: Chunk, index: dict[int, int]) -> tuple[memoryview, list[tuple[int, int]]]:
-        """Return the bytes of a chunk's message indexes, which follow it, and where each channel's begins in them."""
-        places = [(channel, at - chunk.end) for channel, at in index.items()]
-        if not all(0 <= at <= chunk.index_bytes - RECORD_HEAD for _, at in places):
+        """Return the bytes of the message indexes after a chunk, and each channel with the offset of its index in them."""
+        offsets = [(channel, at - chunk.end) for channel, at in index.items()]
+        if not all(0 <= at <= chunk.index_bytes - RECORD_HEAD for _, at in offsets):
             raise DamageError("chunk-index-damaged")
-        return self._bytes.read(chunk.end, chunk.index_bytes), places
+        return self._bytes.read(chunk.end, chunk.index_bytes), offsets
 
     def _index_entries(self, offset: int, channel: int) -> Ints:
         """Return a message index as (log time, offset), shape (N, 2)."""
@@ -225,14 +225,14 @@ class McapPart(ChunkedPart[Chunk]):
         crc = int.from_bytes(self._bytes.peek(end + RECORD_HEAD, 4), "little")
         if not crc or not any(chunk.headless for chunk in self._contents.chunks):
             return
-        found = 0
+        computed = 0
         for start in range(0, end, _LOOSE_BYTES):
-            found = crc32(self._bytes.read(start, min(_LOOSE_BYTES, end - start)), found)
-        if found != crc:
+            computed = crc32(self._bytes.read(start, min(_LOOSE_BYTES, end - start)), computed)
+        if computed != crc:
             self._note("chunk-damaged", end)
 
     def _walk(self, start: int, end: int) -> bool:
-        """Step through the records; after a damaged one, search the next chunk. Return whether the end was reached."""
+        """Read record after record, also after damage; return whether the end of the data was reached."""
         position = start
         while position + RECORD_HEAD <= end:
             if (after := self._take_loose_messages(position, end)) > position:
@@ -272,6 +272,7 @@ class McapPart(ChunkedPart[Chunk]):
         return after
 
     def _take_record(self, opcode: int, position: int, after: int, end: int) -> None:
+        """Add a record to the contents; `DamageError` if it is invalid or truncated."""
         if opcode == OP_CHUNK:
             self._contents.chunks.append(self._parse_chunk(position, after))
             self._bounds.count(len(self._contents.chunks), 0)
@@ -287,6 +288,7 @@ class McapPart(ChunkedPart[Chunk]):
             self._take_message_index(position, after)
 
     def _parse_chunk(self, position: int, after: int) -> Chunk:
+        """Return the chunk at a position; `DamageError` if it is invalid; a truncated chunk ends with the file."""
         chunk = parse_chunk_head(self._bytes.peek(position + RECORD_HEAD, CHUNK_HEAD + 4), position)
         is_whole = chunk.end == after and chunk.uncompressed_bytes <= MAX_CHUNK_BYTES
         if not is_whole or chunk.compression not in ("", "lz4", "zstd"):
@@ -298,13 +300,14 @@ class McapPart(ChunkedPart[Chunk]):
         return chunk
 
     def _take_message_index(self, position: int, after: int) -> None:
+        """Add a message index to the chunk before it."""
         if after - position < RECORD_HEAD + 6:
             raise DamageError("chunk-index-damaged")
         channel = int.from_bytes(self._bytes.peek(position + RECORD_HEAD, 2), "little")
         self._index_entries(position, channel)
         chunk = self._contents.chunks[-1]
         index_bytes = after - chunk.end
-        # Which the chunk takes over: a copy for each entry would cost their square.
+        # The new chunk shares this dict: copies for each entry would take quadratic time.
         index = {} if chunk.index is None else chunk.index
         index[channel] = position
         self._contents.chunks[-1] = replace(chunk, index=index, index_bytes=index_bytes)
@@ -315,7 +318,7 @@ class McapPart(ChunkedPart[Chunk]):
             self._contents.chunks[-1] = replace(self._contents.chunks[-1], index=None)
 
     def _next_chunk(self, start: int, end: int) -> int:
-        """Return where the next plausible chunk begins: its lengths agree with one another and with the file's."""
+        """Return the offset of the next chunk whose lengths are consistent; ``end`` without one."""
         for block_start, size, block in self._bytes.windows(start, end, RECORD_HEAD + CHUNK_HEAD + 4):
             for candidate in _find_possible_chunks(block, size):
                 length = int.from_bytes(block[candidate + 1 : candidate + RECORD_HEAD], "little")
@@ -348,13 +351,14 @@ class McapPart(ChunkedPart[Chunk]):
         self._note_odd_messages()
 
     def _note_odd_messages(self) -> None:
-        """Note messages outside chunks, or in an index, that are of no channel or have no times."""
+        """Record messages outside chunks, or in an index, that have no declared channel or no time."""
         if self._untimed:
             self._note("time-invalid", 0, messages_lost=self._untimed)
         if unknown := self._tallies.keys() - self._contents.channels.keys():
             self._note("channel-undeclared", 0, messages_lost=sum(self._tallies[channel][0] for channel in unknown))
 
     def _declare_and_count(self, chunk: Chunk) -> None:
+        """Declare the channels in a chunk; count its messages if it has no index."""
         try:
             data = self.load(chunk)
         except DamageError as error:
@@ -370,6 +374,7 @@ class McapPart(ChunkedPart[Chunk]):
                 self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
 
     def _declare(self, chunk: Chunk, data: memoryview, records: Ints) -> None:
+        """Add the schemas and channels among the records of a chunk."""
         for offset in records.tolist():
             if data[offset] in (OP_SCHEMA, OP_CHANNEL):
                 length = int.from_bytes(data[offset + 1 : offset + RECORD_HEAD], "little")
@@ -379,6 +384,7 @@ class McapPart(ChunkedPart[Chunk]):
                     self._note(error.cause, chunk.offset)
 
     def _topic(self, number: int) -> Topic:
+        """Return the topic of a channel, with counts and times from the statistics or from the records."""
         channel = self._contents.channels[number]
         schema = self._contents.schemas.get(channel.schema, Schema("", "", ""))
         statistics = self._contents.statistics
@@ -431,7 +437,7 @@ class McapPart(ChunkedPart[Chunk]):
 
 
 def _find_possible_chunks(block: memoryview, size: int) -> list[int]:
-    """Return the offset in ``size`` bytes of a chunk's opcode, followed at the right distance by a compression name."""
+    """Return the offsets in ``size`` bytes at which the opcode and the length of the compression name fit a chunk."""
     opcodes = np.frombuffer(block, np.uint8)[: max(min(size, len(block) - RECORD_HEAD - CHUNK_HEAD), 0)]
     candidates = np.flatnonzero(opcodes == OP_CHUNK)
     if not len(candidates):

@@ -66,10 +66,10 @@ class ChannelRecord:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Place and content of a chunk; messages outside chunks are one without a head (``crc`` 0, no compression).
+    """Position and content of a chunk; successive messages outside chunks are a chunk without a head.
 
-    ``index`` gives the byte of each channel's message index (None if the chunk has none), ``index_bytes`` how long
-    they are together.
+    ``index`` maps a channel to the file offset of its message index (None without any); ``index_bytes`` is the size of
+    all indexes together.
     """
 
     offset: int
@@ -182,37 +182,34 @@ def index_entries(record: bytes | memoryview, channel: int) -> Ints:
 
 
 def index_messages(data: bytes, records: Ints, ends: Ints, channels: Ints) -> tuple[Mask, Ints, Ints, Ints]:
-    """Read several message indexes together.
+    """Read several message indexes in one pass.
 
-    ``records``, ``ends`` and ``channels`` say of each index, shape (R,), where it begins in ``data``, before which byte
-    it must end, and of which channel it should be. The result is whether each index is valid, shape
-    (R,), and of each message of those, shape (N,), the number of its index, its log time [ns] and its offset in the
-    chunk.
+    ``records`` are the offsets of the indexes in ``data``, ``ends`` their upper limits and ``channels`` their expected
+    channels, shape (R,). Return whether each index is valid, shape (R,), and for each message of the valid ones, shape
+    (N,), the number of its index, its log time [ns] and its offset in the chunk.
     """
-    whole = np.flatnonzero(records + RECORD_HEAD + 6 <= ends)
-    right, size = np.zeros(len(records), bool), np.zeros(len(records), np.int64)
-    if len(whole):
-        at = records[whole]
-        size[whole] = gather_integers(data, at + RECORD_HEAD + 2, "u4")
-        right[whole] = (
+    complete = np.flatnonzero(records + RECORD_HEAD + 6 <= ends)
+    is_valid, size = np.zeros(len(records), bool), np.zeros(len(records), np.int64)
+    if len(complete):
+        at = records[complete]
+        size[complete] = gather_integers(data, at + RECORD_HEAD + 2, "u4")
+        is_valid[complete] = (
             (np.frombuffer(data, np.uint8)[at] == OP_MESSAGE_INDEX)
-            & (
-                gather_integers(data, at + 1, "i8") == size[whole] + 6
-            )  # padding is allowed, but so would a broken count look
-            & (gather_integers(data, at + RECORD_HEAD, "u2") == channels[whole])
-            & (size[whole] % 16 == 0)
-            & (at + RECORD_HEAD + 6 + size[whole] <= ends[whole])
+            & (gather_integers(data, at + 1, "i8") == size[complete] + 6)  # rejects padding, which looks like damage
+            & (gather_integers(data, at + RECORD_HEAD, "u2") == channels[complete])
+            & (size[complete] % 16 == 0)
+            & (at + RECORD_HEAD + 6 + size[complete] <= ends[complete])
         )
-    counts = np.where(right, size // 16, 0)
+    counts = np.where(is_valid, size // 16, 0)
     record = np.repeat(np.arange(len(records)), counts)
-    places = records[record] + (RECORD_HEAD + 6) + 16 * number_within(counts)
-    if not len(places):
-        return right, record, places, places
-    return right, record, gather_integers(data, places, "i8"), gather_integers(data, places + 8, "i8")
+    positions = records[record] + (RECORD_HEAD + 6) + 16 * number_within(counts)
+    if not len(positions):
+        return is_valid, record, positions, positions
+    return is_valid, record, gather_integers(data, positions, "i8"), gather_integers(data, positions + 8, "i8")
 
 
 def read_messages_at(data: memoryview, offsets: Ints) -> tuple[Messages, Mask]:
-    """Return the messages at ``offsets`` within the data, and which of them are messages by opcode and length."""
+    """Return the messages at ``offsets`` in the data, and which of them have the opcode and length of messages."""
     heads = gather_values(data, offsets, _MESSAGE)
     messages = Messages(
         data,
@@ -227,20 +224,20 @@ def read_messages_at(data: memoryview, offsets: Ints) -> tuple[Messages, Mask]:
 
 
 def record_offsets(data: bytes | memoryview, most: int) -> tuple[Ints, int]:
-    """Walk the records in ``data``; return their offsets, and the end: the first that does not fit, or is too many."""
-    size, position, found = len(data), 0, array("q")
+    """Return the offsets of the records in ``data`` and their end; stop at an incomplete record or after ``most``."""
+    size, position, offsets = len(data), 0, array("q")
     length_at = struct.Struct("<Q").unpack_from
-    while position + RECORD_HEAD <= size and len(found) <= most:
+    while position + RECORD_HEAD <= size and len(offsets) <= most:
         end = position + RECORD_HEAD + length_at(data, position + 1)[0]
         if end > size:
             break
-        found.append(position)
+        offsets.append(position)
         position = end
-    return np.array(found, np.int64), position
+    return np.array(offsets, np.int64), position
 
 
 def find_message_offsets(data: memoryview, records: Ints) -> Ints:
-    """Return those of the records that are whole messages."""
+    """Return the offsets of the records that are complete messages, shape (M,)."""
     if not len(records):
         return records
     messages: Ints = records[np.frombuffer(data, np.uint8)[records] == OP_MESSAGE]
@@ -260,10 +257,10 @@ class Contents:
     chunks: list[Chunk] = field(default_factory=list)
     statistics: Statistics | None = None
     outline: str = ""
-    """A hash of the summary, where that names every chunk of a file that has some."""
+    """Hash (hex) of the summary; "" if the summary lists no chunk."""
 
     def note(self, opcode: int, content: bytes | memoryview) -> None:
-        """Keep a schema or channel; the first of a number counts, and later ones are ignored, however many."""
+        """Add a schema or channel; the first of each number is used, later ones are ignored."""
         number, fields = int.from_bytes(content[:2], "little"), FieldReader(content)
         if opcode == OP_SCHEMA and number not in self.schemas:
             fields.take("H")
@@ -274,7 +271,7 @@ class Contents:
 
 
 def read_summary(source: ByteSource) -> Contents:
-    """Read the summary section; `DamageError` (without a cause where the writer made none) when it cannot be used."""
+    """Read the summary section; `DamageError` if it cannot be used, without a cause if the writer wrote none."""
     tail_bytes = RECORD_HEAD + FOOTER + len(MAGIC)
     source.expect([(0, len(MAGIC)), (max(source.size - _SUMMARY_BYTES, 0), _SUMMARY_BYTES)])
     tail = bytes(source.read(max(source.size - tail_bytes, 0), min(tail_bytes, source.size)))
@@ -317,6 +314,7 @@ def _check(contents: Contents, file_bytes: int) -> None:
 
 
 def _parsed(section: memoryview) -> Contents:
+    """Return the contents of a summary section."""
     contents = Contents()
     records, end = record_offsets(section, len(section))
     if end < len(section):

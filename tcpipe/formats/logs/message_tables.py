@@ -77,7 +77,7 @@ def make_stamp_fields(stamp_ns: Ints) -> dict[str, Ints]:
 def make_topic(
     name: str, type_name: str, stamp_ns: Ints, read_fields: Callable[[], Fields], damage: Sequence[Damage] = ()
 ) -> TopicMessages:
-    """Return a topic with the messages' stamps [ns], shape (N,), as both log times; `_make_column` makes its fields."""
+    """Return a topic whose messages have the stamps [ns], shape (N,), as both log times; fields are read on demand."""
 
     def make() -> pa.Table:
         times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
@@ -88,7 +88,7 @@ def make_topic(
 
 
 def _make_column(values: GenericArray | pa.Array) -> pa.Array:
-    """Return a column of messages: rows of shape (N, k) become lists, bytes texts."""
+    """Return values as a column of messages: rows of shape (N, k) become lists, bytes become texts."""
     if isinstance(values, pa.Array):
         return values
     if values.dtype.kind == "S":

@@ -125,9 +125,10 @@ class TypeLibrary:
         return self._types[key]
 
     def _resolve(self, type_name: str, definition: str, schema_encoding: str, *, ros1: bool) -> MessageType:
-        known, source = self._read_definitions(type_name, definition, schema_encoding)
+        """Return a type with all its parts; `DefinitionError` if one is unknown, or if they have too many columns."""
+        log_definitions, source = self._read_definitions(type_name, definition, schema_encoding)
         fallback = functools.partial(self._fallback, ros1=ros1)
-        if type_name not in known and fallback(type_name) is None:
+        if type_name not in log_definitions and fallback(type_name) is None:
             where = (
                 "the log contains no definition of it" if not definition.strip() else "its definition names other types"
             )
@@ -135,7 +136,7 @@ class TypeLibrary:
                 f"type {type_name} is unknown: {where}, and none is bundled; give its .msg files with --msgdef DIR"
             )
         definitions: _Definitions = {}
-        wire = _Unfold(known, fallback, definitions).record(type_name, ())
+        wire = _Unfold(log_definitions, fallback, definitions).record(type_name, ())
         if wire.leaves > MAX_COLUMNS:
             raise DefinitionError(f"type {type_name} expands to {wire.leaves} columns, more than {MAX_COLUMNS}")
         return MessageType(wire, source, definitions)
@@ -156,6 +157,7 @@ class TypeLibrary:
             raise
 
     def _fallback(self, type_name: str, *, ros1: bool) -> FieldTypes | None:
+        """Return the fields of a type by the user's, tcpipe's or rosbags' definitions; None if all lack it."""
         for known in (self._own, _load_own_definitions()):
             if type_name in known:
                 return known[type_name]
@@ -173,6 +175,7 @@ class _Unfold:
         self._records: dict[str, Record] = {}
 
     def record(self, name: str, within: tuple[str, ...]) -> Record:
+        """Return a message type with its fields; `DefinitionError` if it is unknown, recursive or repeats a field."""
         if name in within:
             raise DefinitionError(f"type {name} contains itself: {' > '.join((*within, name))}")
         if len(within) > _MAX_DEPTH:
@@ -197,6 +200,7 @@ class _Unfold:
         return element if kind.length is None else Array(element, kind.length if kind.fixed else None)
 
     def _element(self, name: str, within: tuple[str, ...]) -> Scalar | Text | Record:
+        """Return the type of a single value of a field."""
         if name == "string":
             return Text()
         if name in _CODES:
@@ -207,6 +211,7 @@ class _Unfold:
 
 
 def _parse_definitions(type_name: str, definition: str, schema_encoding: str) -> _Definitions:
+    """Parse a definition text of any encoding; `DefinitionError` with the reason of the parser."""
     try:
         if schema_encoding == "ros2idl" or definition.startswith(_SEPARATOR + "IDL: "):
             return _parse_idl(definition)
@@ -238,6 +243,7 @@ def _read_rosbags_fields(_constants: Any, fields: list[tuple[str, Any]]) -> Fiel
 
 
 def _read_rosbags_type(kind: Nodetype, argument: Any) -> FieldType:
+    """Return the type of a field that rosbags parsed; `ValueError` if ROS has no such type."""
     if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         (inner, length), fixed = argument, kind == Nodetype.ARRAY
         if inner[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
@@ -273,20 +279,20 @@ def _read_definitions_of_directory(directory: Path) -> _Definitions:
         raise LogError(
             f"{directory}: there is no such directory; expected one with package/msg/Name.msg files below it"
         )
-    found: _Definitions = {}
+    definitions: _Definitions = {}
     problems = []
     for path in sorted([*directory.rglob("*.idl"), *directory.rglob("*.msg")]):
         package = path.parent.parent.name if path.parent.name == "msg" else path.parent.name
         name = normalize_type_name(str(PurePosixPath(package, path.stem)))
         try:
-            found.update(_parse_definitions(name, path.read_text(errors="replace"), f"ros2{path.suffix[1:]}"))
+            definitions.update(_parse_definitions(name, path.read_text(errors="replace"), f"ros2{path.suffix[1:]}"))
         except DefinitionError as error:
             problems.append(f"{path}: {error}")
     if problems:
         raise LogError(*problems)
-    if not found:
+    if not definitions:
         raise LogError(f"{directory}: no .msg or .idl file below it; expected package/msg/Name.msg")
-    return found
+    return definitions
 
 
 @cache

@@ -57,30 +57,34 @@ def find_rosbag2_files(directory: Path) -> Rosbag2Files:
 
 
 def _find_files_by_name(directory: Path, present: tuple[Path, ...]) -> Rosbag2Files:
+    """Return a bag's files by name; `LogError` if they are not parts of one bag."""
     kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in present}
-    what = _describe_metadata_problem(directory / METADATA)
+    problem = _describe_metadata_problem(directory / METADATA)
     if len(kinds) != 1:
-        found = "no .db3 or .mcap file is there" if not kinds else "both .db3 and .mcap files are there"
-        raise LogError(f"{directory}: not a ROS 2 bag: {METADATA} {what}, and {found}")
+        reason = "no .db3 or .mcap file is there" if not kinds else "both .db3 and .mcap files are there"
+        raise LogError(f"{directory}: not a ROS 2 bag: {METADATA} {problem}, and {reason}")
     if len({_PART.sub("", path.name) for path in present}) > 1:
         names = ", ".join(path.name for path in present[:_LISTED]) + (", …" if len(present) > _LISTED else "")
         raise LogError(
-            f"{directory}: not a ROS 2 bag: {METADATA} {what}, and its files are not named as parts of one ({names}); "
+            f"{directory}: not a ROS 2 bag: {METADATA} {problem}, and its files are not named as parts of one ({names}); "
             "give one of them"
         )
     return Rosbag2Files(present, (Damage("file-unlisted", directory.name, messages_lost=0),))
 
 
 def _find_files_by_metadata(directory: Path, present: tuple[Path, ...], information: Mapping[str, Any]) -> Rosbag2Files:
+    """Return the files that metadata.yaml lists, then unlisted ones; missing and unlisted files are damage."""
     named = information.get("relative_file_paths")
     if isinstance(named, list) and len(named) > MAX_FILES:
         raise LogError(f"{directory}: {METADATA} names {len(named)} files; bags of up to {MAX_FILES} are read")
     listed = [Path(name).name for name in named if isinstance(name, str)] if isinstance(named, list) else []
-    here = {name: next(filter(os.path.isfile, (directory / name, directory / f"{name}.zstd")), None) for name in listed}
-    paths = [path for path in here.values() if path is not None]
-    missing = [name for name, path in here.items() if path is None]
-    taken = set(paths)
-    extra = [p for p in present if p not in taken and p.with_name(p.name.removesuffix(".zstd")) not in taken]
+    path_by_name = {
+        name: next(filter(os.path.isfile, (directory / name, directory / f"{name}.zstd")), None) for name in listed
+    }
+    paths = [path for path in path_by_name.values() if path is not None]
+    missing = [name for name, path in path_by_name.items() if path is None]
+    used = set(paths)
+    extra = [p for p in present if p not in used and p.with_name(p.name.removesuffix(".zstd")) not in used]
     paths += extra
     count = information.get("message_count")
     damage = [Damage("file-unlisted", f"{directory.name}/{path.name}", messages_lost=0) for path in extra]
@@ -131,7 +135,7 @@ def is_one_bag(directory: Path) -> bool:
 
 
 def decompress_file(path: Path, directory: Path) -> Path:
-    """Decompress a zstd file into ``directory`` and return its copy; of a cut one, as much as can be had."""
+    """Decompress a zstd file into ``directory``, a truncated one as far as possible; return the copy."""
     copy = Path(directory, path.name.removesuffix(".zstd"))
     size, written = path.stat().st_size, 0
     try:
@@ -158,7 +162,7 @@ def _decompress_stream(path: Path) -> Iterator[bytes]:
 
 
 def decompress_blocks(part: LogPart, wanted: frozenset[int]) -> Iterator[MessageBlock]:
-    """Yield a part's messages of the wanted channels; zstd frames (``compression_mode: MESSAGE``) are decompressed."""
+    """Yield a part's messages of the requested channels; decompress zstd frames (``compression_mode: MESSAGE``)."""
     compressed: dict[int, bool] = {}
     for block in part.blocks(wanted):
         if block.channel not in compressed:
@@ -169,18 +173,19 @@ def decompress_blocks(part: LogPart, wanted: frozenset[int]) -> Iterator[Message
 
 
 def _decompress_block(block: MessageBlock, part: LogPart) -> MessageBlock:
-    payloads, kept = [], []
+    """Decompress the payloads of a block; exclude and record damaged ones."""
+    payloads, valid_rows = [], []
     for row, (offset, length) in enumerate(zip(block.offsets.tolist(), block.lengths.tolist(), strict=True)):
         payload = _decompress_frame(block.buffer[offset : offset + length])
         if payload is not None:
             payloads.append(payload)
-            kept.append(row)
-    lost = len(block.offsets) - len(kept)
+            valid_rows.append(row)
+    lost = len(block.offsets) - len(valid_rows)
     if lost:
         topic = part.channels[block.channel].name
         part.damage.append(Damage("chunk-damaged", part.name, topic=topic, messages_lost=lost))
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
-    rows = np.array(kept, np.int64)
+    rows = np.array(valid_rows, np.int64)
     return MessageBlock(
         block.channel,
         memoryview(b"".join(payloads)),
@@ -193,14 +198,15 @@ def _decompress_block(block: MessageBlock, part: LogPart) -> MessageBlock:
 
 
 def _decompress_frame(frame: memoryview) -> bytes | None:
+    """Return the content of a zstd frame; None if it is damaged or implausibly large."""
     pieces: list[bytes] = []
-    found = 0
+    size = 0
     try:
         with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(frame)), "zstd") as stream:
             while piece := stream.read(_COPY_BYTES):
                 pieces.append(piece)
-                found += len(piece)
-                if found > MAX_CHUNK_BYTES or is_bomb(len(frame), found, whole=True):
+                size += len(piece)
+                if size > MAX_CHUNK_BYTES or is_bomb(len(frame), size, whole=True):
                     return None
     except OSError:
         return None
@@ -215,8 +221,7 @@ def _read_bag_information(path: Path) -> dict[str, Any] | None:
     try:
         if path.stat().st_size > MAX_METADATA_BYTES:
             return None
-        document = YAML(typ="safe").load(path.read_text(errors="replace"))
-        information = document["rosbag2_bagfile_information"]
+        information = YAML(typ="safe").load(path.read_text(errors="replace"))["rosbag2_bagfile_information"]
     except (YAMLError, KeyError, TypeError, ValueError, OSError, RecursionError):
         return None
     return information if isinstance(information, dict) else None

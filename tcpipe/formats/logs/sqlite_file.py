@@ -2,7 +2,7 @@
 
 SQLite has no checksums: a byte flipped inside a message is not noticed here. But every row of the table of messages
 either becomes a message or is counted as damage, and a file whose pages contradict each other is reported as damaged.
-Of a damaged file, ids are read upward until an error and downward until an error.
+In a damaged file, the reader skips the ranges of ids that SQLite cannot read.
 """
 
 import shutil
@@ -23,15 +23,14 @@ from tcpipe.logs.topics import Topic, normalize_type_name
 MAGIC = b"SQLite format 3\0"
 
 _HEADER_BYTES = 100
-_BLOCK_ROWS, _BLOCK_BYTES = 4096, 1 << 23
-"""Most rows of a block, and its size after which no row is added [byte]."""
+_BLOCK_ROWS, _BLOCK_BYTES = 4096, 1 << 23  # most rows of a block, and its size after which no row is added [byte]
 _BEFORE_ALL, _LAST_ID = -1e19, 2**63 - 1
 _MOST_HOLES = 1000  # most damaged ranges after which reading of a file ends: the end of each is searched
+# SQLite refuses a row that claims to be longer, or longer than its file: a chain of pages may lead back to itself.
 _LONGEST_BYTES, _ROW_BYTES = 1 << 28, 1 << 10
-"""SQLite refuses a row that claims to be longer, or longer than its file: a chain of pages may lead back to itself."""
 _TABLES = ("topics", "messages", "message_definitions")
+# Errors of a damaged database; the second if its message has a damaged name, the third if a row is endless.
 _BROKEN = (sqlite3.Error, UnicodeDecodeError, MemoryError)
-"""Errors of a damaged database; the second if its message has a damaged name, the third if a row is endless."""
 _Row = tuple[int, int, int, int, bytes]  # row id, topic, log time, publish time, data
 
 
@@ -49,9 +48,8 @@ class SqlitePart(LogPart):
             self._database = self._open(path)
             self._database.text_factory = lambda text: text.decode(errors="backslashreplace")
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(path.stat().st_size + _ROW_BYTES, _LONGEST_BYTES))
-            self._database.execute(
-                "PRAGMA writable_schema = ON"
-            )  # else SQLite refuses a file that lacks its last pages
+            # Without this, SQLite refuses a file that lacks its last pages.
+            self._database.execute("PRAGMA writable_schema = ON")
             self._refuse_odd_tables(path)
             self.channels = self._channels(path)
         except LogError:
@@ -79,32 +77,32 @@ class SqlitePart(LogPart):
         if not topics:
             return
         self._note_contradictions()
-        rows, held = list[_Row](), 0
+        rows, gathered_bytes = list[_Row](), 0
         columns, is_message = self._message_columns()
         of_topics = f"{is_message} AND topic_id IN ({','.join(map(str, topics))})"
         for row in self._reachable(f"SELECT {columns} FROM messages WHERE {of_topics}"):  # noqa: S608
             rows.append(row)
-            held += len(row[-1])
-            if held > _BLOCK_BYTES or len(rows) == _BLOCK_ROWS:
+            gathered_bytes += len(row[-1])
+            if gathered_bytes > _BLOCK_BYTES or len(rows) == _BLOCK_ROWS:
                 yield from _read_blocks(rows)
-                rows, held = [], 0
+                rows, gathered_bytes = [], 0
         if rows:
             yield from _read_blocks(rows)
 
     def _open(self, path: Path) -> sqlite3.Connection:
-        """Open without locks or files beside it; with an unmerged journal or a partial last page through a copy."""
+        """Open the file read-only and without locks, or a copy if it has an unmerged journal or a partial last page."""
         with path.open("rb") as file:
             head = file.read(_HEADER_BYTES)
         page_bytes = int.from_bytes(head[16:18], "big")
         page_bytes = 65536 if page_bytes == 1 else max(page_bytes, 1)
         size = path.stat().st_size
-        pages = int.from_bytes(head[28:32], "big") if head[24:28] == head[92:96] else 0  # else the count is an old one
-        wanted = page_bytes * (pages or -(-size // page_bytes))
+        pages = int.from_bytes(head[28:32], "big") if head[24:28] == head[92:96] else 0  # else the count is outdated
+        expected_bytes = page_bytes * (pages or -(-size // page_bytes))
         journal = path.with_name(path.name + "-wal")
-        has_journal = size >= wanted and journal.exists() and journal.stat().st_size > 0
-        if size < wanted:
+        has_journal = size >= expected_bytes and journal.exists() and journal.stat().st_size > 0
+        if size < expected_bytes:
             self._is_cut = True
-            self._note("file-cut", size, bytes_lost=wanted - size)
+            self._note("file-cut", size, bytes_lost=expected_bytes - size)
         if has_journal or (self._is_cut and size % page_bytes):
             copy = self._opened.enter_context(make_scratch_directory()) / path.name
             shutil.copyfile(path, copy)
@@ -128,6 +126,7 @@ class SqlitePart(LogPart):
                 raise LogError(f"{path}: its {name!r} is no plain table; tcpipe does not read it")
 
     def _channels(self, path: Path) -> dict[int, Topic]:
+        """Return the topics of the file by number; record messages of other topics as damage."""
         rows = self._database.execute(
             "SELECT id, name, type, serialization_format FROM topics ORDER BY id LIMIT ?", (MAX_CHANNELS + 1,)
         ).fetchall()
@@ -152,8 +151,7 @@ class SqlitePart(LogPart):
                 schema_encoding=schema_encoding,
             )
         if unknown := spans.keys() - channels.keys():
-            lost = sum(spans[number][0] for number in unknown)
-            self._note("channel-undeclared", messages_lost=lost)
+            self._note("channel-undeclared", messages_lost=sum(spans[number][0] for number in unknown))
         return channels
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
@@ -176,12 +174,12 @@ class SqlitePart(LogPart):
                     f"{by_topic} WHERE {is_message} GROUP BY topic_id"
                 )
             }
-            every = self._database.execute("SELECT COUNT(*) FROM messages NOT INDEXED").fetchone()[0]
-            lost = every - sum(count for count, _, _ in spans.values())
+            row_count = self._database.execute("SELECT COUNT(*) FROM messages NOT INDEXED").fetchone()[0]
+            lost = row_count - sum(count for count, _, _ in spans.values())
         except _BROKEN:
             spans, lost = {}, 0
-            each = f"SELECT id, topic_id, timestamp, {is_message} FROM messages WHERE TRUE"  # noqa: S608
-            for _, topic, stamp, right in self._reachable(each):
+            all_rows = f"SELECT id, topic_id, timestamp, {is_message} FROM messages WHERE TRUE"  # noqa: S608
+            for _, topic, stamp, right in self._reachable(all_rows):
                 lost += not right
                 if right:
                     count, first, last = spans.get(topic, (0, stamp, stamp))
@@ -203,13 +201,13 @@ class SqlitePart(LogPart):
         before, low, row = _BEFORE_ALL, _BEFORE_ALL, None
         for _ in range(_MOST_HOLES):
             broken = ""
-            for limit in ("", " LIMIT 1"):  # with an error sqlite3 drops the row before it
+            for limit in ("", " LIMIT 1"):  # on an error, sqlite3 also drops the previous row
                 try:
                     for row in self._database.execute(f"{query} AND id > ? ORDER BY id{limit}", (low,)):
                         if row[0] > low:
                             before, low = low, row[0]
                             yield row
-                        elif before < row[0] != low:  # it was the id of the row before that is wrong
+                        elif before < row[0] != low:  # the id of the previous row was wrong
                             low = row[0]
                             yield row
                     break
@@ -217,8 +215,7 @@ class SqlitePart(LogPart):
                     broken = _describe_error(error)
             if not broken:
                 return
-            reason = broken if row is None else f"after message {low}: {broken}"
-            self._note("database-damaged", reason=reason)
+            self._note("database-damaged", reason=broken if row is None else f"after message {low}: {broken}")
             row = self._first_behind(query, max(int(low), 0))
             if row is None:
                 return
@@ -233,14 +230,14 @@ class SqlitePart(LogPart):
             step *= 2
         if low + step > _LAST_ID:
             return None
-        missed, found = low + step // 2, low + step
-        while found - missed > 1:
-            middle = (missed + found) // 2
+        unreadable, readable = low + step // 2, low + step
+        while readable - unreadable > 1:
+            middle = (unreadable + readable) // 2
             if self._first_from(query, middle) is None:
-                missed = middle
+                unreadable = middle
             else:
-                found = middle
-        return self._first_from(query, found)
+                readable = middle
+        return self._first_from(query, readable)
 
     def _first_from(self, query: str, number: int) -> Any:
         """Return the first row with this id or a larger one; None without one, or if SQLite cannot read it."""
@@ -250,16 +247,16 @@ class SqlitePart(LogPart):
             return None
 
     def _note_contradictions(self) -> None:
-        """Note contradictions between the pages of a file, over many of which SQLite reads on without an error."""
+        """Record contradictions between the pages of a file; SQLite itself reads past many of them without an error."""
         if self._is_cut:  # which is noted already
             return
         try:
             self._database.execute("PRAGMA ignore_check_constraints = ON")
-            found = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
+            problem = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
         except _BROKEN as error:
-            found = _describe_error(error)
-        if found != "ok" and " value in " not in found:  # a value that is none is the row's own trouble, and counted
-            self._note("database-damaged", reason=found.splitlines()[-1])
+            problem = _describe_error(error)
+        if problem != "ok" and " value in " not in problem:  # rows with wrong values are counted elsewhere
+            self._note("database-damaged", reason=problem.splitlines()[-1])
 
 
 def _describe_error(error: Exception) -> str:

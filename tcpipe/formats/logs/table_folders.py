@@ -22,17 +22,17 @@ Mappings = Mapping[str, TableMapping]
 
 
 def list_table_files(folder: Path) -> list[Path]:
-    """Return the tables in a folder and below it, by name; hidden ones are passed over."""
+    """Return the tables in a folder and below it, by name, without hidden ones."""
     return sorted(Path(place) / name for place, _, names in walk_folders(folder) for name in names if is_table(name))
 
 
 @dataclass(frozen=True, slots=True)
 class TableRun:
-    """The tables of one run if a recipe's names have a ``*``: files of one folder in which it is the same text."""
+    """The tables of one run: files of a folder in whose names the recipe's ``*`` is the same text."""
 
     folder: Path
     mappings: dict[str, TableMapping]
-    """With the names of this run's files."""
+    """The recipe's mappings, with the names of this run's files."""
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -51,19 +51,19 @@ def find_table_logs(path: Path, mappings: Mappings) -> list[tuple[Path, ...]]:
         return [run.files] if (run := find_table_run(path, mappings)) else []
     numbered = [mapping.file for mapping in mappings.values() if "*" in mapping.file]
     fixed = [mapping.file for mapping in mappings.values() if mapping.file and "*" not in mapping.file]
-    found = list[tuple[Path, ...]]()
-    for place, folders, _ in walk_folders(path):
-        folder = Path(place)
+    logs = list[tuple[Path, ...]]()
+    for directory, folders, _ in walk_folders(path):
+        folder = Path(directory)
         files = sorted(file for pattern in numbered for file in folder.glob(pattern))
         runs = (run for file in files if (run := find_table_run(file, mappings)))
         if grouped := dict.fromkeys(run.files for run in runs):
-            found += grouped
+            logs += grouped
         elif any((folder / file).is_file() for file in fixed):
-            found.append((folder,))
+            logs.append((folder,))
         else:
             continue
         folders.clear()
-    return found
+    return logs
 
 
 def find_table_run(path: Location, mappings: Mappings) -> TableRun | None:
@@ -88,24 +88,24 @@ def find_table_run(path: Location, mappings: Mappings) -> TableRun | None:
 def walk_folders(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     """Yield each folder, its folders (which the caller may remove) and its files; links to folders are not followed.
 
-    As `os.walk`, which on Python 3.11 calls itself as deep as folders are nested. Stores and datasets are left out: a
-    log does not change because somebody keeps its results beside it.
+    Unlike `os.walk` on Python 3.11, it does not recurse. It skips stores and datasets, so that results in a log's
+    folder do not change the log.
     """
     waiting = [str(folder)]
     while waiting:
-        place = waiting.pop()
+        directory = waiting.pop()
         folders, names = list[str](), list[str]()
-        with suppress(OSError), os.scandir(place) as entries:
+        with suppress(OSError), os.scandir(directory) as entries:
             for entry in entries:
                 if not entry.is_dir(follow_symlinks=False):
                     names.append(entry.name)
                 elif not entry.name.startswith((".", "~")):
                     folders.append(entry.name)
         folders.sort()
-        if {*names} >= _DATASET or ("calls" in folders and _is_store(place)):
+        if {*names} >= _DATASET or ("calls" in folders and _is_store(directory)):
             continue
-        yield place, folders, names
-        waiting += (f"{place}/{name}" for name in reversed(folders))
+        yield directory, folders, names
+        waiting += (f"{directory}/{name}" for name in reversed(folders))
 
 
 def _is_store(place: str) -> bool:

@@ -1,13 +1,11 @@
-"""A folder of tables as a log: each mapped table is a topic, and its rows are messages as its role usually has.
+"""A folder of tables as a log: each mapped table is a topic, and its rows are messages of the type usual for its role.
 
-It has the interface of a bag: topics, tables of messages, damage. All tables are read when it is opened: they are small
-compared with a bag.
+It has the interface of a bag: topics, tables of messages, damage. All tables are read when the log is opened, because
+they are small compared with a bag.
 
-Tables that others wrote, as CSV, text in columns (TUM trajectories, RTKLIB's .pos) or Parquet: polars' lazy scan,
-columns by name.
-
-The first lines of a text table determine its separator, the names of its columns (`column_1` and so on without a
-header), and its comments. A cell that should be a number and is not is counted, never guessed.
+Tables are CSV files, text in columns (TUM trajectories, RTKLIB's .pos) or Parquet; polars scans them lazily. The first
+lines of a text table determine its separator, the names of its columns (`column_1` and so on without a header), and its
+comments. Cells that should be numbers and are not are counted.
 """
 
 import re
@@ -32,19 +30,19 @@ from tcpipe.recipe import TableMapping
 
 
 def open_tables(path: Path, mappings: Mappings, files: Sequence[Path] | None = None) -> TableLog:
-    """Read the mapped tables of a folder, of which ``files`` are the log's, by default all.
+    """Read the mapped tables of a folder; ``files`` are the files of the log, by default all tables.
 
-    `LogError` has a line for each thing in which the mapping and the folder do not agree.
+    `LogError` has a line for each contradiction between the mapping and the folder.
     """
     problems: list[str] = []
     read: list[TopicMessages] = []
     zone = next((mapping.stamp_zone for mapping in mappings.values() if mapping.stamp_zone), "")
     for name, mapping in mappings.items():
-        found = _read_table(path, name, mapping, mapping.stamp_zone or zone)
-        if isinstance(found, TopicMessages):
-            read.append(found)
+        table = _read_table(path, name, mapping, mapping.stamp_zone or zone)
+        if isinstance(table, TopicMessages):
+            read.append(table)
         else:
-            problems += found
+            problems += table
     problems += _find_clock_mismatch(read)
     if problems:
         raise LogError(*(f"{path}: {problem}" for problem in problems))
@@ -52,7 +50,7 @@ def open_tables(path: Path, mappings: Mappings, files: Sequence[Path] | None = N
 
 
 def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> TopicMessages | list[str]:
-    """Return a table's messages, or all problems of its mapping; ``zone`` is used for times without one ("": none)."""
+    """Return a table's messages, or all problems of its mapping; ``zone`` is the zone of times without one, or ""."""
     where = f"recipe tables.{name}"
     role = mapping.role or name
     problems = list(find_mapping_problems(where, role, mapping.columns, mapping.units))
@@ -112,9 +110,9 @@ def _read_table(folder: Path, name: str, mapping: TableMapping, zone: str) -> To
 def _read_messages(
     read_as: tuple[str, str, str], file: str, values: Mapping[str, Floats], stamps: Clock, damage: Sequence[Damage]
 ) -> TopicMessages:
-    """Return a table as its topic's messages with type and role, sorted by time, and the damage of it and its cells.
+    """Return the messages of a table, sorted by time, and its damage; ``read_as`` is topic, type and role.
 
-    Rows without any of the values are no messages: several sensors share a table, and each row is of one of them.
+    Rows without values are no messages: in a table that several sensors share, each row belongs to one sensor.
     """
     topic, kind, role = read_as
     has_value = np.any([np.isfinite(value) for value in values.values()], axis=0)
@@ -202,7 +200,7 @@ def describe_duplicates(names: Sequence[str]) -> dict[str, str]:
 
 
 def read_cells(path: Path, *, stamps: Sequence[str], columns: Sequence[str], words: Sequence[str] = ()) -> Cells:
-    """Read columns of stamps, of numbers and of ``words`` or numbers, and no other.
+    """Read the columns of stamps, of numbers, and of ``words`` as they are stored.
 
     `LogError`: the file cannot be read as a table.
     """
@@ -217,7 +215,7 @@ def read_cells(path: Path, *, stamps: Sequence[str], columns: Sequence[str], wor
 
 
 def read_numbers(path: Path, names: Sequence[str]) -> dict[str, Floats]:
-    """Return the first rows of numeric columns, shape (rows,), NaN for cells without a number; `LogError`: no table."""
+    """Return the first rows of numeric columns, shape (N,), NaN for cells without a number; `LogError`: no table."""
     with _report_unreadable(path):
         frame = _collect_columns(path, [*names], numbers=[*names], rows=_SAMPLE_ROWS)
     numbers = {name: frame[name].cast(pl.Float64) for name in names if frame[name].dtype.is_numeric()}
@@ -227,7 +225,7 @@ def read_numbers(path: Path, names: Sequence[str]) -> dict[str, Floats]:
 def read_column_values(
     path: Path, stamps: Sequence[str], fields: Mapping[str, FieldSource]
 ) -> tuple[Cells, dict[str, Floats]]:
-    """Return the cells that fields are made of, and the fields' values, shape (rows,)."""
+    """Return the cells from which fields are computed, and the values of the fields, shape (N,) each."""
     used = {name: [column for column, _ in field.expression.operands()] for name, field in fields.items()}
     numbers = [column for name, columns in used.items() if name != "quality" for column in columns]
     cells = read_cells(path, stamps=stamps, columns=numbers, words=used.get("quality", ()))
@@ -248,7 +246,7 @@ def _collect_columns(
 
 
 def _find_non_number(path: Path, name: str) -> tuple[int, int, str] | None:
-    """Return the number of cells that are no numbers, and row (from 1) and text of the first."""
+    """Return the number of cells that are not numbers, and row (from 1) and text of the first."""
     texts = _collect_columns(path, [name], numbers=None)[name].cast(pl.String)
     is_invalid = texts.is_not_null() & (texts.str.strip_chars() != "") & texts.cast(pl.Float64, strict=False).is_null()
     rows = is_invalid.arg_true()
@@ -256,7 +254,7 @@ def _find_non_number(path: Path, name: str) -> tuple[int, int, str] | None:
 
 
 def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '"') -> pl.LazyFrame:
-    """Return a table's lazy frame, with ``numbers`` read as such; None reads all cells as text."""
+    """Return a lazy frame of a table, with the columns ``numbers`` as numbers; None reads all cells as text."""
     if path.suffix == ".parquet":
         return pl.scan_parquet(path)
     with path.open("rb") as file:
@@ -311,7 +309,7 @@ def _is_name(field: bytes) -> bool:
 
 
 def _find_column_names(comments: list[bytes], count: int, *, spaced: bool) -> list[str]:
-    """Return the names of a table without a header: those of its last comment if they fit, TUM's, or numbers."""
+    """Return column names of a table without a header: from its last comment if they fit, of TUM, or numbered."""
     names = comments[-1].lstrip(b"#% ").replace(b",", b" ").split() if comments else []
     if len(names) == count:
         return [name.decode(errors="replace") for name in names]

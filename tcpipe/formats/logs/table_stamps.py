@@ -24,8 +24,8 @@ _FORMS = (
 _GPS_TIME = "GPST"  # RTKLIB's name of a column of GPS time
 _OF_UTC = re.compile(r"(.*_)?(utc|gmt|zulu)(_.*)?")
 _OF_DAY = re.compile(r"(.*_)?ms_(today|of_day)")
+# Units of counters, by column names that are a unit or a function of a microcontroller.
 _COUNTERS = {"millis": "ms", "micros": "us", **{unit: unit for unit in STAMP_UNITS}}
-"""Units of counters, by column names that are a unit or a function of a microcontroller."""
 _DATE_IN_NAME = re.compile(r"(?<!\d)(20\d\d)([-_.]?)([01]\d)\2([0-3]\d)(?!\d{3})")
 _DAY_NS = 86_400_000_000_000
 _SAMPLE_ROWS = 1000
@@ -34,12 +34,12 @@ _MIN_FAST_SHARE = 0.9
 _PREFERRED = ("counter", "day", "local", "utc")
 _MAX_TIE_SPREAD_NS, _MAX_STRAY_SHARE = 2_000_000_000, 0.05
 _COARSEST = tuple(reversed(STAMP_UNITS.items()))
+# Which of two equal local times is meant at the end of summer time, before and after the clock was set back.
 _REPEATED_HOUR: tuple[Literal["earliest", "latest"], ...] = ("earliest", "latest")
-"""Which of two equal local times is meant at the end of summer time, before and after the clock was set back."""
 _LONGEST_STEP_BACK = timedelta(minutes=30)  # A larger step back in a table sets the clock back
 _NO_STAMPS = "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
 RecipeKeys: TypeAlias = dict[str, tuple[str, str, bool]]
-"""By key of a table of the recipe its value, a note, and whether it is certain."""
+"""Value, note and certainty of each key of one of the recipe's tables."""
 Kind: TypeAlias = Literal["utc", "local", "day", "counter"]
 
 
@@ -47,8 +47,8 @@ Kind: TypeAlias = Literal["utc", "local", "day", "counter"]
 class Clock:
     """Stamps of rows, shape (N,), null if unknown: [ns] since 1970 (UTC or local), since midnight, or of a counter.
 
-    ``unit`` is that of numbers whose size and name state none, by their steps; ``sample`` is the first text, "" of
-    numbers; ``notes`` are assumptions.
+    ``unit`` is guessed from the steps of numbers whose size and name state no unit, else ""; ``sample`` is the first
+    text, "" for numbers; ``notes`` are assumptions.
     """
 
     kind: Kind
@@ -65,25 +65,26 @@ class Clock:
 def find_stamps(
     columns: Mapping[str, pl.Series], stamp: str, mapping: TableMapping, *, zone: str, path: Path
 ) -> Clock | str:
-    """Return the stamps of a table of the recipe in UTC, or of a counter; in words why they cannot be read.
+    """Return the stamps of a mapped table, in UTC or of a counter, or the reason why they cannot be read.
 
-    ``columns`` contains the columns that ``stamp``, ``stamp_date`` and ``stamp_utc`` name, ``zone`` that of times
-    without one.
+    ``columns`` contains the columns that ``stamp``, ``stamp_date`` and ``stamp_utc`` name; ``zone`` is the zone of
+    times without one.
     """
     try:
-        found = _read_stamps(columns, stamp, mapping, "UTC" if mapping.stamp_utc else zone, path)
-        if isinstance(found, Clock) and mapping.stamp_utc:
+        clock = _read_stamps(columns, stamp, mapping, "UTC" if mapping.stamp_utc else zone, path)
+        if isinstance(clock, Clock) and mapping.stamp_utc:
             as_utc = replace(mapping, stamp_unit="auto", stamp_format="")
             utc = _read_stamps(columns, mapping.stamp_utc, as_utc, "UTC", path)
-            found = f"stamp_utc, {mapping.stamp_utc}: {utc}" if isinstance(utc, str) else _tie_to_utc(found, utc)
+            clock = f"stamp_utc, {mapping.stamp_utc}: {utc}" if isinstance(utc, str) else _tie_to_utc(clock, utc)
     except pl.exceptions.PolarsError as error:
         return str(error).splitlines()[0]
-    return found if isinstance(found, str) else replace(found, ns=found.ns + round(mapping.offset_s * 1e9))
+    return clock if isinstance(clock, str) else replace(clock, ns=clock.ns + round(mapping.offset_s * 1e9))
 
 
 def _read_stamps(
     columns: Mapping[str, pl.Series], stamp: str, mapping: TableMapping, zone: str, path: Path
 ) -> Clock | str:
+    """Return the clock of a column of stamps, in UTC if possible, or a message on what the recipe must state."""
     dates = columns.get(mapping.stamp_date)
     clock = _read_dated(columns[stamp], dates, form=mapping.stamp_format, unit=mapping.stamp_unit)
     if isinstance(clock, str):
@@ -100,7 +101,7 @@ def _read_stamps(
 
 
 def _read_dated(column: pl.Series, dates: pl.Series | None, *, form: str = "", unit: str = "auto") -> Clock | str:
-    """Return the unit of a column of times, and the column of dates for times of day; or why it is no clock."""
+    """Return the clock of a column of times, with ``dates`` added to times of day, or the reason why it is no clock."""
     clock = read_clock(column, form=form, unit=unit)
     if dates is None or column.dtype not in (pl.String, pl.Time) or getattr(clock, "kind", "day") != "day":
         return clock
@@ -109,9 +110,9 @@ def _read_dated(column: pl.Series, dates: pl.Series | None, *, form: str = "", u
 
 
 def read_clock(column: pl.Series, *, form: str = "", unit: str = "auto") -> Clock | str:
-    """Return the unit of a column of times, or the reason why it is no clock.
+    """Return the clock of a column of times, or the reason why it is no clock.
 
-    ``form`` is the recipe's ``stamp_format`` of texts, ``unit`` its ``stamp_unit`` of numbers.
+    ``form`` is the recipe's ``stamp_format`` for texts, ``unit`` its ``stamp_unit`` for numbers.
     """
     if not column.count() or column.dtype.is_nested() or column.dtype == pl.Duration:
         return _NO_STAMPS
@@ -240,23 +241,27 @@ def _tie_to_utc(clock: Clock, utc: Clock) -> Clock | str:
 
 
 def choose_clock(columns: Mapping[str, pl.Series]) -> tuple[Clock, RecipeKeys] | None:
-    """Return the clock among columns that may be stamps, and the keys that state it, None without one.
+    """Return the clock of the best column of stamps, and its keys in the recipe; None without a clock.
 
-    It is the finest: rows of a wide table share a coarse time, as whole seconds of GNSS. Of equally fine ones, dates go
-    before counters, numbers before texts, which are often cut to seconds.
+    The clock with the finest stamps is best, because rows of a wide table share coarse times, such as whole seconds of
+    GNSS. Of equally fine clocks, dates come before counters, and numbers before texts, which are often cut to seconds.
     """
     dates = next((column for name, column in columns.items() if re.fullmatch("(.*_)?date", simplify_name(name))), None)
-    read = {name: _read_candidate(column, dates) for name, column in columns.items()}
-    found = {name: each for name, each in read.items() if each and each[0].ns.count() > 1}
-    if not found:
+    read_columns = {name: _read_candidate(column, dates) for name, column in columns.items()}
+    candidates = {
+        name: candidate for name, candidate in read_columns.items() if candidate and candidate[0].ns.count() > 1
+    }
+    if not candidates:
         return None
-    rows = {name: clock.count_stamps() for name, (clock, _) in found.items()}
-    fast = [name for name in found if rows[name] >= _MIN_FAST_SHARE * max(rows.values())]
-    clock, keys = found[max(fast, key=lambda name: (_PREFERRED.index(found[name][0].kind), not found[name][0].sample))]
-    utc = next((name for name, (other, _) in found.items() if other.kind == "utc"), "")
+    rows = {name: clock.count_stamps() for name, (clock, _) in candidates.items()}
+    fast = [name for name in candidates if rows[name] >= _MIN_FAST_SHARE * max(rows.values())]
+    clock, keys = candidates[
+        max(fast, key=lambda name: (_PREFERRED.index(candidates[name][0].kind), not candidates[name][0].sample))
+    ]
+    utc = next((name for name, (other, _) in candidates.items() if other.kind == "utc"), "")
     if clock.unit or (clock.kind == "day" and not clock.sample):
         keys["stamp_unit"] = (clock.unit, "by its steps", True) if clock.unit else ("ms_today", "", True)
-    if clock.kind != "utc" and utc and isinstance(tied := _tie_to_utc(clock, found[utc][0]), Clock):
+    if clock.kind != "utc" and utc and isinstance(tied := _tie_to_utc(clock, candidates[utc][0]), Clock):
         clock, keys["stamp_utc"] = tied, (utc, "coarser, but UTC", True)
     elif clock.kind in ("local", "day") and not _is_utc(keys["stamp"][0]):
         keys["stamp_zone"] = "UTC", 'or as "Europe/Vienna": the zone of times without one, of all tables', False
@@ -264,7 +269,7 @@ def choose_clock(columns: Mapping[str, pl.Series]) -> tuple[Clock, RecipeKeys] |
 
 
 def _read_candidate(column: pl.Series, dates: pl.Series | None) -> tuple[Clock, RecipeKeys] | None:
-    """Return a column's clock and the keys of the recipe that it needs, None of a column that is no clock."""
+    """Return the clock of a column and its keys in the recipe; None if the column is no clock."""
     clock, keys = _read_dated(column, dates), RecipeKeys()
     if isinstance(clock, str) and "stamp_format" in clock:
         keys["stamp_format"] = DAY_FIRST, clock, False

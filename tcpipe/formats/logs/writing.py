@@ -1,9 +1,8 @@
 """Writing logs: columns of numbers become messages in a .mcap, a ROS 1 .bag or a ROS 2 bag directory.
 
-The home of mcap's writer and of rosbags on the writing side. Every message of a stream has one layout (its strings and
-sequences keep their lengths), so that one example is serialised by rosbags and the rest are copies of its bytes with
-the columns patched in; the position of a field is found by serialising it twice with different bytes, not by a second
-model of the encoding.
+The home of mcap's writer and of rosbags on the writing side. All messages of a stream have the same
+layout, because strings and sequences keep their lengths. rosbags serialises one message; the others are copies of its
+bytes with the values of the columns. Two serialisations with different bytes of a field show the position of the field.
 """
 
 import functools
@@ -117,14 +116,14 @@ def _sort_messages(streams: Sequence[MessageStream], encoding: Encoding) -> list
 
 
 def _serialize_messages(stream: MessageStream, encoding: Encoding) -> Bytes:
-    """Return the serialised messages, one a row."""
+    """Return the serialised messages, shape (N, bytes)."""
     store = _store_of(stream, encoding)
     encode: Callable[[object, str], Any] = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
     count = stream.log_time_ns.size
     if not count:
         return np.empty((0, 0), np.uint8)
-    found = {name: _find_field(store, stream.type_name, name) for name in stream.columns}
-    columns = {name: values for name, values in stream.columns.items() if found[name] is not None}
+    field_types = {name: _find_field(store, stream.type_name, name) for name in stream.columns}
+    columns = {name: values for name, values in stream.columns.items() if field_types[name] is not None}
     _check_lengths(stream.topic, columns)
     first = {name: _to_rosbags_value(values[0]) for name, values in columns.items()}
     message = _make_message(store, stream.type_name, _nest_fields({**stream.constants, **first}))
@@ -134,38 +133,38 @@ def _serialize_messages(stream: MessageStream, encoding: Encoding) -> Bytes:
 
     rows = np.tile(serialize(), (count, 1))
     for name, values in columns.items():
-        kind, argument = found[name]
+        kind, argument = field_types[name]
         base = str(argument[0] if kind == Nodetype.BASE else argument[0][1][0])  # of a number, or an array's numbers
         dtype = values.dtype if values.dtype.kind == "S" else np.dtype(_BYTES.get(base, base))
-        start = _place(message, name, dtype, serialize)
+        start = _find_offset(message, name, dtype, serialize)
         packed = np.ascontiguousarray(values.reshape(count, -1), dtype=dtype).view(np.uint8)
         rows[:, start : start + packed.shape[1]] = packed
     return rows
 
 
 def _check_lengths(topic: str, columns: NamedArrays) -> None:
-    """Reject values that cannot be patched in: strings of several lengths, and arrays of Python objects."""
+    """Reject columns that have no fixed layout: strings of several lengths, and arrays of Python objects."""
     for name, values in columns.items():
         ragged = values.dtype.kind == "S" and (np.char.str_len(values) != values.dtype.itemsize).any()
         if ragged or values.dtype.kind not in "biufS":
             raise UsageError(f"{topic}: column {name} ({values.dtype}) expected numbers, or bytes of one length")
 
 
-def _place(message: Any, name: str, dtype: np.dtype[Any], serialize: Callable[[], Bytes]) -> int:
-    """Return where a field begins in the serialised message: it is written twice, with different bytes."""
+def _find_offset(message: Any, name: str, dtype: np.dtype[Any], serialize: Callable[[], Bytes]) -> int:
+    """Return the offset of a field in the serialised message, which is serialised with two values of the field."""
     *parents, leaf = name.split(".")
     owner = functools.reduce(getattr, parents, message)
-    kept = getattr(owner, leaf)
-    written = []
+    original = getattr(owner, leaf)
+    versions = []
     for byte in (b"\x00", b"\x01"):
         filler = np.frombuffer(byte * dtype.itemsize, dtype)[0]
-        changed = byte.decode() * len(kept) if isinstance(kept, str) else filler.item()
-        object.__setattr__(owner, leaf, np.full_like(kept, filler) if isinstance(kept, np.ndarray) else changed)
-        written.append(serialize())
-    object.__setattr__(owner, leaf, kept)
-    if written[0].size != written[1].size or not (written[0] != written[1]).any():
+        changed = byte.decode() * len(original) if isinstance(original, str) else filler.item()
+        object.__setattr__(owner, leaf, np.full_like(original, filler) if isinstance(original, np.ndarray) else changed)
+        versions.append(serialize())
+    object.__setattr__(owner, leaf, original)
+    if versions[0].size != versions[1].size or not (versions[0] != versions[1]).any():
         raise UsageError(f"message field {name} has a position that varies with the message, so it cannot be a column")
-    return int(np.flatnonzero(written[0] != written[1])[0])
+    return int(np.flatnonzero(versions[0] != versions[1])[0])
 
 
 def _find_field(store: Typestore, type_name: str, name: str) -> Any:
@@ -177,6 +176,7 @@ def _find_field(store: Typestore, type_name: str, name: str) -> Any:
 
 
 def _nest_fields(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Return fields by dotted name as nested dicts."""
     tree: dict[str, Any] = {}
     for name, value in flat.items():
         *parents, leaf = name.split(".")
@@ -188,7 +188,7 @@ def _nest_fields(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _to_rosbags_value(value: Any) -> Any:
-    """Return a row of a column as rosbags wants it in a message."""
+    """Return a value of a column as rosbags expects it in a message."""
     if isinstance(value, np.bytes_):
         return value.decode()
     return value if isinstance(value, np.ndarray) else value.item()
@@ -196,20 +196,21 @@ def _to_rosbags_value(value: Any) -> Any:
 
 def _make_message(store: Typestore, type_name: str, values: Mapping[str, Any]) -> Any:
     """Return a message with the given values; the rest is zero or empty."""
-    made = {}
+    field_values = {}
     fields: list[tuple[str, Any]] = store.fielddefs[type_name][1]
     for name, (kind, argument) in fields:
         value = values.get(name)
         if kind == Nodetype.NAME:
-            made[name] = _make_message(store, argument, value or {})
+            field_values[name] = _make_message(store, argument, value or {})
         elif kind == Nodetype.BASE:
-            made[name] = value if value is not None else {"string": "", "bool": False}.get(argument[0], 0)
+            field_values[name] = value if value is not None else {"string": "", "bool": False}.get(argument[0], 0)
         else:
-            made[name] = _make_elements(store, argument, value)
-    return store.types[type_name](**made)
+            field_values[name] = _make_elements(store, argument, value)
+    return store.types[type_name](**field_values)
 
 
 def _make_elements(store: Typestore, argument: Any, value: Any) -> Any:
+    """Return the value of an array field; zeros, or an empty list, if no value is given."""
     (kind, inner), length = argument
     if kind == Nodetype.NAME:
         return [_make_message(store, inner, element) for element in (value or [])]
@@ -220,7 +221,7 @@ def _make_elements(store: Typestore, argument: Any, value: Any) -> Any:
 
 
 def _store_of(stream: MessageStream, encoding: Encoding) -> Typestore:
-    """Return the types, with that of the stream among them."""
+    """Return the types of an encoding, with the stream's own type."""
     store = _make_typestore(encoding)
     if stream.definition and stream.type_name not in store.types:
         store.register(get_types_from_msg(stream.definition, stream.type_name))
