@@ -358,7 +358,7 @@ _LIKE_A_URL = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
 
 
 def check_local_output(path: Location) -> Path:
-    """Return where something is written. `UsageError`: it is a URL, of which a local directory ``s3:`` would become."""
+    """Return the path of a local output; `UsageError` for a URL, which would become a local directory ``s3:``."""
     found = _LIKE_A_URL.match(str(path))
     if found and "://" in str(path):
         raise UsageError(f"{path}: is a URL; tcpipe writes this on this machine: give a path, and copy the result")
@@ -384,7 +384,7 @@ def check_output(path: Location, wanted: str = "directory") -> Path:
 
 
 def check_file_name(path: Path, *endings: str) -> None:
-    """Raise `UsageError` unless a path is that of a file with one of these endings, there or not."""
+    """Raise `UsageError` unless a path is a file, existing or not, with one of these endings."""
     if path.suffix.lower() not in endings or path.is_dir():
         raise UsageError(f"{path}: expected the name of a file that ends in {' or '.join(endings)}")
 

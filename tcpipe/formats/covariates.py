@@ -1,4 +1,4 @@
-"""Tables of others, CSV or Parquet; covariates (ground, weather), of which a sample gets the last row before it."""
+"""Covariates such as ground or weather, from tables in CSV or Parquet; a sample gets the last row before it."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime

@@ -373,8 +373,7 @@ class InspectedDataset(DatasetCard):
 def judge_dataset(findings: Iterable[Finding], runs: Iterable[RunSource], maps: Iterable[MapSource]) -> Verdict:
     """Return the verdict on a dataset, with the worst finding of each code as reasons, by its runs with samples."""
     of_runs = (finding for run in runs if run.samples for finding in run.findings)
-    of_maps = (finding for source in maps for finding in source.findings)
-    return judge_by_code([*findings, *of_runs, *of_maps])
+    return judge_by_code([*findings, *of_runs, *(finding for source in maps for finding in source.findings)])
 
 
 def group_dataset_findings(

@@ -83,7 +83,7 @@ def describe_finding(finding: Finding) -> str:
 
 
 def describe_remedy(finding: Finding, remedy: Remedy) -> str:
-    """Return the action of a remedy with its keys or command in one line; of arrays of tables only that they follow."""
+    """Return the action of a remedy with its keys or command as one line; arrays of tables follow separately."""
     purpose = _find_purpose(finding.code, remedy)
     what = [f"'{remedy.command}'"] if remedy.command else []
     what += (
@@ -101,7 +101,7 @@ def _find_purpose(code: str, remedy: Remedy) -> str:
 
 
 def list_remedies(findings: Sequence[Finding]) -> list[tuple[str, list[str]]]:
-    """Return the remedy of findings of one code: its action, commands and recipe lines; else the advice."""
+    """Return the remedy of findings of one code: action, commands and recipe lines; or the advice without a remedy."""
     remedies: list[Remedy] = []
     for remedy in chain.from_iterable(finding.remedies for finding in findings):
         if remedy not in remedies:
@@ -205,7 +205,7 @@ def _join(names: Sequence[str]) -> str:
 
 
 def format_loss(loss: StoreLoss) -> str:
-    """Return a loss of distance as one line, with how to avoid it."""
+    """Return a loss of distance and its remedy as one line."""
     runs = "1 run" if loss.runs == 1 else f"{loss.runs} runs"
     advice = advise_on_loss(loss.reason)
     return f"{loss.metres:>9.1f} m ({loss.share:.1%}) {loss.reason.replace('_', ' ')} in {runs}{f': {advice}' if advice else ''}"

@@ -65,7 +65,7 @@ def to_json(value: Any) -> str:
 
 
 def to_json_line(value: Any) -> str:
-    """Return the same on one line, without an end."""
+    """Return the same JSON on one line, without a line break at the end."""
     text = json.dumps(to_plain(value), sort_keys=True, ensure_ascii=False, allow_nan=False)
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 

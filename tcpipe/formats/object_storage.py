@@ -104,7 +104,7 @@ class StoredObject:
         os.utime(to, ns=(self.modified_ns, self.modified_ns))
 
     def _range(self, span: tuple[int, int]) -> memoryview:
-        """Return one span of the object as it was when it was found."""
+        """Return one span of the object in the version that was listed."""
         from obstore.exceptions import PreconditionError  # noqa: PLC0415  most runs stay on this machine
 
         options: GetOptions = {"range": span, "if_match": self.tag} if self.tag else {"range": span}
@@ -204,7 +204,7 @@ def lay_out_objects(
 
 
 def make_stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Path:
-    """Create placeholders of the objects at or below a URL: empty files of the right names, sizes and times."""
+    """Create placeholders of the objects at or below a URL: files with their names, sizes and times."""
     shown, query = split_url(url, one_object=True)
     _lay_out_stand_ins(shown, query, directory, wanted)
     return _place_of(shown, directory)

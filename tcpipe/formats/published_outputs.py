@@ -168,7 +168,7 @@ def _find_card(place: Place, cards: Sequence[str]) -> FoundCard | None:
 
 
 def _iterate_pointers(place: Place, names: Iterable[str]) -> Iterator[_Pointer]:
-    """Yield the pointers among the names at a place, the valid one first; damaged ones are skipped."""
+    """Yield the pointers among the names at a place, the valid one first; skip damaged ones."""
     found = [match for name in names if (match := _POINTER.fullmatch(name))]
     for match in sorted(found, key=lambda match: (-int(match[1]), match[2])):
         data = place.read(match[0])

@@ -140,7 +140,7 @@ def load_shipped_profiles() -> Profiles:
 
 
 def load_profiles(recipe: Recipe | IngestSections) -> Profiles:
-    """Return the profiles of a recipe, and those of the package that it does not replace."""
+    """Return the profiles of a recipe, and the package's profiles that it does not replace."""
     of_tables = [source for name, table in recipe.tables.items() if (source := table.make_power_source(name))]
     return Profiles(recipe.robots, [*recipe.power_sources, *of_tables]).before(load_shipped_profiles())
 

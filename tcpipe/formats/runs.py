@@ -1,4 +1,4 @@
-"""The record of one run: its JSON is the manifest, of which the summary for all runs is a part."""
+"""The record of one run; its JSON is the manifest, and a part of it is the summary that lists of runs use."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence

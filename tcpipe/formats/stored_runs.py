@@ -180,7 +180,7 @@ _TABLES = ("track.parquet", "segments.parquet", "rejections.parquet", REPORT)
 
 
 class Unnamed(NamedTuple):
-    """A folder of payload that no document names, or such a file in a folder of which other files are named."""
+    """A folder of payload that no document names, or a file that none names in a folder with named files."""
 
     name: str
     size_bytes: int

@@ -174,7 +174,7 @@ def _make_class_sections(found: Evaluation) -> list[PageSection]:
 
 
 def _iterate_class_rows(found: Evaluation, split: str, quantity: str) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of a quantity in table I or II: measures beside the paper's and their lower bounds."""
+    """Yield the rows of a quantity in table I or II: measures, the paper's values and lower bounds."""
     part = found.splits[split]
     classes = [*part.class_order, ALL]
 
@@ -215,7 +215,7 @@ def _make_other_sections(found: Evaluation) -> list[PageSection]:
 def _make_other_section(
     title: str, text: str, found: Evaluation, quantity: Literal["E", "T"], errors: Mapping[str, Mapping[str, Errors]]
 ) -> PageSection:
-    """Return errors of a quantity by predictor, on every split, beside the paper's."""
+    """Return errors of a quantity by predictor on every split, with the paper's errors."""
     splits = found.ordered_splits
     rows: list[tuple[str, ...]] = []
     for name, by_split in errors.items():

@@ -30,7 +30,7 @@ Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
 
 @dataclass(frozen=True, slots=True)
 class FitConfig(TrainConfig):
-    """Settings of a training: those of the recipe, and those of a call."""
+    """Settings of a training, from the recipe and from the call."""
 
     model: ModelKind | Literal["auto"] = "resnet18"
     """``auto``: chosen by cross-validation over runs."""

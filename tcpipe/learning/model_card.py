@@ -58,7 +58,7 @@ class TrainingRange:
     class_counts: Mapping[int, int]
     """Samples by their terrain class."""
     pixel_classes: tuple[int, ...]
-    """Class ids of which any pixel occurs."""
+    """Ids of the classes that occur in any pixel."""
     ranges: Mapping[str, tuple[float, float]]
     """Smallest and largest ``slope_rad``, ``cross_slope_rad``, ``relief_m`` (highest above lowest pixel of a patch)."""
     layers: Mapping[str, LayerRange] = omit({})
@@ -85,7 +85,7 @@ class Training:
     """Hash of dataset and options: the same key, the same training."""
     config: FitConfig
     kind: ModelKind
-    """Kind of the model: that of the options, or the one that was chosen."""
+    """Kind of the model: stated by the options, or chosen."""
     samples: Mapping[str, int]
     """``fitted``, and ``held out`` to stop by."""
     epochs: int

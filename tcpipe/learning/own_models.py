@@ -60,7 +60,7 @@ def load_own_kind(source: str) -> OwnKind:
 
 
 def _make_kind(found: Any, source: str) -> type[Predictor]:
-    """Return a class with every method of `Predictor`: those of the user, and the defaults."""
+    """Return a class with the user's methods, and with the defaults of `Predictor` for all others."""
     if inspect.isclass(found) and hasattr(found, "predict"):
         return found if Predictor in found.__mro__ else type(found.__name__, (found, Predictor), {})
     if callable(found):
@@ -71,7 +71,7 @@ def _make_kind(found: Any, source: str) -> type[Predictor]:
 
 @contextmanager
 def report_errors(own: OwnKind | str | None) -> Iterator[None]:
-    """Convert exceptions of the user's code into `ModelError` with the location; None: no such code runs."""
+    """Convert exceptions of the user's code into `ModelError` with the location; with None, do nothing."""
     source = own.source if isinstance(own, OwnKind) else own
     try:
         yield

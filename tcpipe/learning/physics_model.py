@@ -41,7 +41,7 @@ class PhysicsModel(Predictor):
     grade_newton: Floats
     """N, shape ()."""
     recovered: Floats
-    """Share of negative work that comes back, shape ()."""
+    """Fraction of negative work that is recovered, shape ()."""
     usual_turn_radpm: Floats
     """Usual turn of a metre of the training samples, for metres with an unknown turn, shape ()."""
     rolling_newton: Floats

@@ -50,8 +50,7 @@ def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
     if power_column:
         columns = {"w": (energy.power, energy.power_std), **columns, "E": (energy.energy, energy.energy_std)}
     has_costs = [np.isfinite(split.column(name).astype(float)) for name, _ in columns.values()]
-    with_label = np.isfinite(split.labels).all(axis=1) & np.all(has_costs, axis=0)
-    chosen = split.take(with_label)
+    chosen = split.take(np.isfinite(split.labels).all(axis=1) & np.all(has_costs, axis=0))
     deviations = {cost: chosen.column(std).astype(float) for cost, (_, std) in columns.items()}
     own_deviations = {cost: chosen.own_std(std) for cost, (_, std) in columns.items()}
     labels = dict(zip(split.label_columns, chosen.labels.T.astype(float), strict=True))
@@ -78,8 +77,7 @@ class Predicted:
     @classmethod
     def centre(cls, residuals: Residuals, prediction: Prediction, class_ids: Ints, chord_m: float) -> Predicted:
         """Return costs of predictions of power and velocity, by the predictor's own held-out samples."""
-        is_time = "velocity_mps" in residuals and "power_watt" not in residuals
-        names = ("v", "T") if is_time else QUANTITIES
+        names = ("v", "T") if "velocity_mps" in residuals and "power_watt" not in residuals else QUANTITIES
         power, velocity = prediction.mean[:, 0], np.maximum(prediction.mean[:, 1], LEAST_VELOCITY_MPS)
         centred_power, centred_velocity = fit_bias_correction(residuals).apply(power, velocity, class_ids)
         costs = compute_costs(centred_power, np.maximum(centred_velocity, LEAST_VELOCITY_MPS), chord_m)

@@ -67,7 +67,7 @@ class Inputs:
 
     @property
     def depth(self) -> int:
-        """Return the number of planes of a network's input: those of a patch, and one for each extra feature."""
+        """Return the number of planes of a network's input: the planes of a patch, and one for each extra feature."""
         return len(self.planes) + len(self.extra_features)
 
 
@@ -202,7 +202,7 @@ class Predictor(Protocol):
 
     @classmethod
     def from_arrays(cls, arrays: NamedArrays, inputs: Inputs) -> Predictor:
-        """Return the model of `to_arrays`; `ModelError` if the arrays are those of another."""
+        """Return the model that `to_arrays` stored; `ModelError` if the arrays belong to another kind."""
         del arrays, inputs
         return cls()
 

@@ -59,9 +59,9 @@ class TrainResult:
     """``done`` or ``unchanged``."""
     model: ModelKind
     samples: Mapping[str, int]
-    """Fitted, and held out to stop by."""
+    """Number of samples: fitted, and held out for early stopping."""
     epochs: int
-    """Or trees a label, at most, and how many were best."""
+    """Largest and best number of epochs, or of trees for each label."""
     best_epoch: int
     held_out_loss: float
     device: str
@@ -204,7 +204,7 @@ def train(
 
 
 def _report_layers(data: Dataset, channels: Sequence[str], *, is_chosen: bool) -> None:
-    """Log which layers of a dataset a model takes, and warn of those of the user's that it does not take unasked."""
+    """Log which layers of a dataset a model uses, and warn of the user's layers that it uses only if asked to."""
     named = {channel.removesuffix(ONE_HOT) for channel in channels}
     taken = [
         *(name for name in LAYERS if name in named),
@@ -272,7 +272,7 @@ def make_training_samples(
 
 
 def _find_extra_features(used: Split, wanted: Sequence[str] | None, data: Dataset) -> tuple[ExtraFeature, ...]:
-    """Return those of the wanted features that the samples have; `DatasetError` where --extra-features finds none."""
+    """Return the requested features that the samples have; `DatasetError` if --extra-features finds none."""
     names = _CALLED if wanted is None else wanted
     found = tuple(feature for feature in available_features(read_extra_features(used)) if feature.name in names)
     lacking = [_CALLED[name] for name in names if name not in {feature.name for feature in found}]

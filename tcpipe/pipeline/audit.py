@@ -96,7 +96,7 @@ def score_comparisons(comparisons: Sequence[Comparison]) -> WithheldScore:
 
 
 def _judge_coverage(within: tuple[float, float], windows: int) -> Calibration:
-    """Compare the shares inside 1σ and 2σ with a normal distribution's; few windows can share one place or fault."""
+    """Return whether the shares inside 1σ and 2σ fit a normal distribution; few windows can share one fault."""
     if windows < 5:
         return "undecided"
     count_1, count_2 = (share * windows for share in within)
@@ -107,7 +107,7 @@ def _judge_coverage(within: tuple[float, float], windows: int) -> Calibration:
 
 
 def place_windows(span_s: float, length_s: float) -> Floats:
-    """Return start and end of even windows of a span [s], shape (N, 2), with a window's length between them."""
+    """Return start and end of evenly spaced windows in a span [s], shape (N, 2); a gap is at least a window long."""
     inner_s = span_s - 2.0 * END_S
     count = max(int((inner_s + length_s) / (2.0 * length_s)), 0)
     gap_s = (inner_s - count * length_s) / max(count - 1, 1)
@@ -143,30 +143,30 @@ class TrackRows:
 def compare_fixes(
     fixes: Positions, rows: TrackRows, windows_ns: Ints, numbers: Ints, *, arm_m: Floats, arm_std_m: Floats
 ) -> Comparison:
-    """Compare one fix a second of some windows: those of a second share the error of the track, and much of their own.
+    """Compare one fix a second in some windows with the track; fixes within a second have nearly the same error.
 
-    The uncertainty of the arm is part of base_link's σ, not of the antenna's: an error of the arm moves both.
+    The uncertainty of the lever arm is part of base_link's σ, not of the antenna's, and is subtracted.
     """
     number = np.searchsorted(windows_ns[:, 0], fixes.stamp_ns) - 1
     start_ns, end_ns = windows_ns[np.maximum(number, 0)].T
     inside = np.flatnonzero(np.isin(number, numbers) & (fixes.stamp_ns < end_ns) & rows.find(fixes.stamp_ns))
     second = (fixes.stamp_ns - start_ns) // 1_000_000_000
-    kept = inside[np.unique([number[inside], second[inside]], axis=1, return_index=True)[1]]
-    if not kept.size:
+    chosen = inside[np.unique([number[inside], second[inside]], axis=1, return_index=True)[1]]
+    if not chosen.size:
         raise FusionError("no fix is on the track of the other sensors")
-    stamp_ns = fixes.stamp_ns[kept]
+    stamp_ns = fixes.stamp_ns[chosen]
     rpy = [rows.interpolate(f"{name}_rad", stamp_ns) for name in ("roll", "pitch", "yaw")]
     rotation = matrix_from_quat(quat_from_rpy(*rpy))[:, :2]
     predicted = np.stack([rows.interpolate(f"{axis}_m", stamp_ns) for axis in "xy"], -1) + rotation @ arm_m
     std = np.stack([rows.interpolate(f"{axis}_std_m", stamp_ns) for axis in "xy"], -1)
-    variance = np.maximum(std**2 - rotation**2 @ arm_std_m**2, 0.0) + fixes.variance_m2[kept, :2]
+    variance = np.maximum(std**2 - rotation**2 @ arm_std_m**2, 0.0) + fixes.variance_m2[chosen, :2]
     window_s = float(windows_ns[0, 1] - windows_ns[0, 0]) * 1e-9
-    return Comparison(window_s, number[kept], fixes.position_enu_m[kept, :2] - predicted, np.sqrt(variance))
+    return Comparison(window_s, number[chosen], fixes.position_enu_m[chosen, :2] - predicted, np.sqrt(variance))
 
 
 @dataclass(frozen=True, slots=True)
 class WithheldComparisons:
-    """Comparisons of a run by window length, reasons of missing ones; without fixes track length per odometry's."""
+    """Comparisons of a run by window length, and reasons of missing ones; without fixes, ratios of track to odometry."""
 
     comparisons: tuple[Comparison, ...]
     skipped: tuple[str, ...]
@@ -210,6 +210,7 @@ _OTHER_ARM = {"lever-arm-unknown", "lever-arm-contradicted"}  # findings of an a
 
 
 def _compare_fixes(track: Track, section: Section, gnss: Positions, windows_ns: Ints, arm_m: Floats) -> Comparison:
+    """Compare withheld fixes with a track; `FusionError` if the track has no fixes left, or no motion there."""
     facts = track.info.report.facts
     if facts.fuse is not None and not {*FIXES}.intersection(facts.fuse.sensors):
         raise FusionError("tcpipe excludes the other fixes of the run")
@@ -245,7 +246,7 @@ def withhold(streams: Streams, epoch: int, windows_ns: Ints) -> Streams:
 
 
 def _compare_lengths(track: Track, section: Section) -> dict[str, float]:
-    """Return the horizontal length of the track over the distance that each odometry measures, by role."""
+    """Return the ratio of the horizontal length of the track to the distance of each odometry, by role."""
     rows = _select_rows(track, section)
     if rows.stamp_ns.size == 0:
         return {}
@@ -326,12 +327,12 @@ def audit(
     """
     name = format_path(run)
     streams, config = read_audited(run, recipe, robot=robot, message_definitions=message_definitions, store=store)
-    found = compare_withheld(streams, config, run_id=name)
-    skipped = tuple(f"{find_fixes_role(streams)}, {reason}" for reason in found.skipped)
-    if not found.comparisons and not found.length_ratios:
+    compared = compare_withheld(streams, config, run_id=name)
+    skipped = tuple(f"{find_fixes_role(streams)}, {reason}" for reason in compared.skipped)
+    if not compared.comparisons and not compared.length_ratios:
         raise UsageError(f"{name}: nothing can be withheld and compared", *skipped)
-    scores = tuple(score_comparisons([each]) for each in found.comparisons)
-    return Audit(name, streams.robot, scores, skipped, found.length_ratios)
+    scores = tuple(score_comparisons([each]) for each in compared.comparisons)
+    return Audit(name, streams.robot, scores, skipped, compared.length_ratios)
 
 
 def read_audited(

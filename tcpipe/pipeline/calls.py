@@ -37,7 +37,7 @@ def is_alive(process: Process) -> bool | None:
     here = identify_process()
     if (process.host, process.machine) != (here.host, here.machine) or not (process.boot and process.start):
         return None
-    if process.boot != here.boot:  # of a machine without an identity only its name is known, which others may have
+    if process.boot != here.boot:  # machines without an identity may share a name
         return False if here.machine else None
     return _read_start_time(process.pid) == process.start if process.namespace == here.namespace else None
 
@@ -59,7 +59,7 @@ class OpenCall:
     """A call that has begun and not ended."""
 
     name: str
-    """By which it is acknowledged."""
+    """Name by which a person acknowledges it."""
     state: Literal["running", "perhaps running", "killed"]
     """``perhaps running`` if its process cannot be observed from here."""
     call: Call
@@ -77,7 +77,7 @@ class OpenCall:
 
     @property
     def problem(self) -> Problem:
-        """That it was killed, as far as that is known."""
+        """The problem that it was killed, or that it may have been."""
         process = self.call.process
         code = "call-killed" if process and is_alive(process) is False else "call-lost"
         names = {"command": self.call.command, "begin": self.call.begin[:19]}
@@ -86,7 +86,7 @@ class OpenCall:
         return Problem(make_finding(code, Subject("call", self.name), names=names, remedies=[remedy]), self.name)
 
 
-# After so long a call of a machine that cannot be asked from here is reported as lost: calls are made every night.
+# Age from which a call on a machine that cannot be observed is reported as lost [s]; calls are made every night.
 _LONGEST_S = 86_400.0
 CALL_PREFIX = "call-"
 
@@ -110,7 +110,7 @@ def _find_state(call: Call) -> Literal["running", "perhaps running", "killed"]:
 
 @dataclass(slots=True)
 class RunningCall:
-    """A call that runs: the state when it began, to which it adds what it writes, and its record."""
+    """A running call: its record, and the state of the store when it began, with all that it has written since."""
 
     store: Store
     state: State
@@ -188,11 +188,11 @@ def _close_killed_calls(running: RunningCall) -> None:
 
     A call counts as killed only if a listing made after its process was found dead shows no end of it.
     """
-    dead = [open_call for open_call in list_open_calls(running.state) if open_call.state == "killed"]
-    for each in dead:
-        if each.key == running.key or not _is_done_by(each.call, running.call):
+    killed_calls = [open_call for open_call in list_open_calls(running.state) if open_call.state == "killed"]
+    for killed in killed_calls:
+        if killed.key == running.key or not _is_done_by(killed.call, running.call):
             continue
-        close_call(running.store, running.state, each, f"its work was done by {CALL_PREFIX}{running.key}")
+        close_call(running.store, running.state, killed, f"its work was done by {CALL_PREFIX}{running.key}")
 
 
 def close_call(store: Store, state: State, killed: OpenCall, message: str) -> None:

@@ -35,7 +35,7 @@ class Difference:
     causes: tuple[str, ...]
     """Differences of the inputs of both."""
     samples: Mapping[str, int]
-    """Samples only in one, in both, and how many of these have other labels, columns beside them, patches, folds."""
+    """Samples only in one, in both, and how many of these differ in labels, other columns, patches or fold."""
     moved: Mapping[str, int]
     """Samples of both by the splits that they moved between, ``train to test`` …."""
     labels: Mapping[str, Mapping[str, float]]
@@ -72,7 +72,7 @@ def diff(a: Location, b: Location) -> Difference:
     shared = [name for name in columns[0] if name in columns[1]]
     tables = tuple(read_samples(directory, ["sample_id", "split", *LABEL_STD]) for directory in (first, second))
     at = pc.index_in(tables[0].column("sample_id"), value_set=tables[1].column("sample_id").combine_chunks())
-    row = at.to_numpy(zero_copy_only=False)  # value of b for each of a, NaN if it is missing
+    row = at.to_numpy(zero_copy_only=False)  # row of b for each row of a, NaN if it is missing
     in_a = np.flatnonzero(np.isfinite(row))
     in_b = row[in_a].astype(np.int64)
     both = ((first, in_a), (second, in_b))
@@ -133,27 +133,28 @@ def _read_values(table: pa.Table, name: str) -> Floats:
 
 
 def _measure_changes(directories: tuple[Path, Path]) -> dict[str, dict[str, float]]:
+    """Return statistics of the changes of each label and its σ, over samples of both datasets at the same time."""
     matched = _match_by_time(*(read_samples(directory, ["run_id", "start_ns", "end_ns"]) for directory in directories))
-    found = dict[str, dict[str, float]]()
+    statistics = dict[str, dict[str, float]]()
     for name in (*LABEL_STD, *LABEL_STD.values()):
         ours, theirs = (
             _read_values(read_samples(directory, [name]), name)[rows]
             for directory, rows in zip(directories, matched, strict=True)
         )
         change = np.abs(theirs - ours)
-        known = np.isfinite(change)
-        if not known.any():
+        is_known = np.isfinite(change)
+        if not is_known.any():
             continue
-        count, change = int(known.sum()), change[known]
-        found[name] = {"samples": count, "median": float(np.median(change)), "largest": float(change.max())}
+        count, change = int(is_known.sum()), change[is_known]
+        statistics[name] = {"samples": count, "median": float(np.median(change)), "largest": float(change.max())}
         if std := LABEL_STD.get(name):
-            std_a = _read_values(read_samples(directories[0], [std]), std)[matched[0]][known]
-            found[name]["largest_in_std"] = float((change[std_a > 0.0] / std_a[std_a > 0.0]).max(initial=0.0))
-    return found
+            std_a = _read_values(read_samples(directories[0], [std]), std)[matched[0]][is_known]
+            statistics[name]["largest_in_std"] = float((change[std_a > 0.0] / std_a[std_a > 0.0]).max(initial=0.0))
+    return statistics
 
 
 def _match_by_time(a: pa.Table, b: pa.Table) -> tuple[Ints, Ints]:
-    """Return the samples of one run that share most of the longer one's time: another track is cut at other places."""
+    """Return rows of samples in both that are of one run and share most of their time, shape (M,) each."""
     runs = pc.unique(b.column("run_id"))
     run = [pc.index_in(table.column("run_id"), value_set=runs).fill_null(-1).to_numpy() for table in (b, a)]
     begin_b, end_b, begin_a, end_a = (to_integers(table, f"{end}_ns") for table in (b, a) for end in ("start", "end"))
@@ -164,8 +165,7 @@ def _match_by_time(a: pa.Table, b: pa.Table) -> tuple[Ints, Ints]:
     is_same = (in_b < len(b)) & (run[0][np.minimum(in_b, len(b) - 1)] == run[1][in_a]) if len(b) else in_b < 0
     in_a, in_b = in_a[is_same], in_b[is_same]
     shared_ns = np.minimum(end_a[in_a], end_b[in_b]) - np.maximum(begin_a[in_a], begin_b[in_b])
-    longer_ns = np.maximum(end_a[in_a] - begin_a[in_a], end_b[in_b] - begin_b[in_b])
-    enough = shared_ns >= _SHARED * longer_ns
+    enough = shared_ns >= _SHARED * np.maximum(end_a[in_a] - begin_a[in_a], end_b[in_b] - begin_b[in_b])
     return in_a[enough], in_b[enough]
 
 
@@ -198,17 +198,17 @@ def _find_differing_patches(
 
 
 def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> Ints:
-    """Return a hash of every patch, in the order of the samples: equal pixels, equal hashes."""
+    """Return a hash of the pixels of every patch, in the order of the samples, shape (N,)."""
     files = open_patches(directory, card)
-    found = np.empty(table.num_rows, np.int64)
+    hashes = np.empty(table.num_rows, np.int64)
     for piece in range(len(files.starts) - 1):
         pixels = files.read(piece, files.layers)
         count = len(next(iter(pixels.values())))
         flat = [np.ascontiguousarray(layer).reshape(count, -1).view(np.uint8) for layer in pixels.values()]
-        found[files.starts[piece] : files.starts[piece + 1]] = [
+        hashes[files.starts[piece] : files.starts[piece + 1]] = [
             hash(b"".join(part.tobytes() for part in parts)) for parts in zip(*flat, strict=True)
         ]
-    return found[find_places_in_files(card, table.column("split").to_numpy())]
+    return hashes[find_places_in_files(card, table.column("split").to_numpy())]
 
 
 _WORDS = {
@@ -220,7 +220,7 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 def list_causes(a: DatasetCard, b: DatasetCard) -> tuple[str, ...]:
-    """Return a line for each entry of the records of two datasets that differs, in the order of the fields."""
+    """Return a line for each difference between the recorded inputs of two datasets, in the order of the fields."""
     changes = list(compare_records(a.made_from, b.made_from))
     lines = [_describe_change(change, a, b) for change in changes]
     if a.inputs != b.inputs and not changes:
@@ -252,6 +252,7 @@ def _map_changes(a: MapSource, b: MapSource) -> Iterator[str]:
 
 
 def _iterate_lines(found: Difference) -> Iterator[str]:
+    """Yield causes and effects of a difference as lines of text."""
     if found.same:
         yield f"{found.a} and {found.b}: the same {found.samples['in both']} samples, made from the same"
         return

@@ -130,16 +130,16 @@ def explain(sample_id: str, *, dataset: Location = "dataset", store: Location = 
         )
     sample = _read_sample(directory, sample_id)
     run = _find_run(opened, directory, card, sample)
-    window, streams = (sample["start_ns"], sample["end_ns"]), read_streams(run.place, run.facts)
+    span_ns, streams = (sample["start_ns"], sample["end_ns"]), read_streams(run.place, run.facts)
     return Explained(
         sample_id,
         History(
             sample=sample,
             quality=flag_names(sample["quality"], Quality),
             run=run.facts,
-            messages={} if streams is None else dict(_find_messages(streams, *window)),
-            masks=tuple(_iterate_masks(run, *window)),
-            rejected=tuple(_iterate_rejections(run, *window)),
+            messages={} if streams is None else dict(_find_messages(streams, *span_ns)),
+            masks=tuple(_iterate_masks(run, *span_ns)),
+            rejected=tuple(_iterate_rejections(run, *span_ns)),
             map=next((source for source in card.maps if source.name == sample["map"]), None),
             recipe_differs_in={
                 key: item for key, item in flatten_recipe(card.recipe).items() if item != _DEFAULTS.get(key)
@@ -171,13 +171,13 @@ def _find_run(store: Store, directory: Path, card: DatasetCard, sample: Row) -> 
         raise DatasetError(
             f"{directory}: its card lists no run {sample['run_id']}; 'tcpipe verify {directory}' lists all problems"
         )
-    found = store.find_runs(f"{sample['run_id']}/{recipe_id}")
-    if not found:
+    runs = store.find_runs(f"{sample['run_id']}/{recipe_id}")
+    if not runs:
         raise DatasetError(
             f"{store.root}: run {sample['run_id']} of recipe {recipe_id} is not in this store; "
             f"name the store from which {directory} was built with --store"
         )
-    return found[0]
+    return runs[0]
 
 
 def _find_messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tuple[str, MessageRange]]:
@@ -204,6 +204,7 @@ def _find_messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tup
 
 
 def _iterate_masks(run: StoredRun, start_ns: int, end_ns: int) -> Iterator[NearbyMask]:
+    """Yield the spans of masked track near a segment, with reasons."""
     table = run.track().table
     stamps, bits = to_integers(table, "stamp_ns"), to_integers(table, "dropped_by")
     near = slice(*np.searchsorted(stamps, [start_ns - _NEARBY_NS, end_ns + _NEARBY_NS]))
@@ -247,6 +248,7 @@ _SHOWN_LABELS = (
 
 
 def _iterate_lines(sample_id: str, facts: History) -> Iterator[str]:
+    """Yield the history of a sample as lines of text."""
     sample, run, ground = facts.sample, facts.run, facts.map
     fold = "" if sample["fold"] is None else f", fold {sample['fold']}"
     yield f"{sample_id}: row {sample['row']}, split {sample['split']}{fold}"
@@ -256,13 +258,13 @@ def _iterate_lines(sample_id: str, facts: History) -> Iterator[str]:
         if sample[column] is not None
     ]
     yield f"labels   {', '.join(labels)}; quality {', '.join(facts.quality) or 'clean'}"
-    there = [path if is_url(path) or Path(path).exists() else f"{path} (now missing)" for path in run.log.paths]
-    yield f"log      {', '.join(there)} (sha256 {run.log.sha256[:12]}…), run {run.run_id}, robot {run.robot}"
+    paths = [path if is_url(path) or Path(path).exists() else f"{path} (now missing)" for path in run.log.paths]
+    yield f"log      {', '.join(paths)} (sha256 {run.log.sha256[:12]}…), run {run.run_id}, robot {run.robot}"
     yield f"stamps   {sample['start_ns']} to {sample['end_ns']} ns"
-    for role, found in facts.messages.items():
-        count = found.last - found.first + 1
-        which = f"{found.first} to {found.last} ({count})" if count else "none"
-        yield f"messages {role}: {found.topic}, {which} of {found.of} as read, by {found.time} time"
+    for role, messages in facts.messages.items():
+        count = messages.last - messages.first + 1
+        numbers = f"{messages.first} to {messages.last} ({count})" if count else "none"
+        yield f"messages {role}: {messages.topic}, {numbers} of {messages.of} as read, by {messages.time} time"
     for mask in facts.masks:
         yield f"masked   {mask.apart_s:.2f} s {mask.where}: {', '.join(mask.why)}, {mask.rows} rows"
     for rejected in facts.rejected:

@@ -107,7 +107,7 @@ def export(
     `LogError`: the log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file
     belongs to another log or to no export, or ``out`` is a dataset, run, map, model, cost map or store.
     """
-    _refuse_what_is_ours(out)
+    _refuse_own_output(out)
     clear(out)
     shown = format_path(log_path)
     with open_single_log(log_path, message_definitions=message_definitions) as log:
@@ -121,8 +121,8 @@ def export(
         paths = _make_paths(out, sorted(log.topics))
         index = _read_index(out)
         _refuse_others_files(index, made_from, {name: paths[name] for name in wanted})
-        known = index.topics if index is not None and index.made_from == made_from else {}
-        if index is not None and wanted and all(_is_there(known.get(name), out) for name in wanted):
+        exported = index.topics if index is not None and index.made_from == made_from else {}
+        if index is not None and wanted and all(_is_there(exported.get(name), out) for name in wanted):
             return _make_exported("unchanged", index, wanted, shown, out)
         rows = _write(log, {name: paths[name] for name in wanted})
         if wanted and not any(count is not None for count in rows.values()):
@@ -136,7 +136,7 @@ def export(
             )
             for name, count in rows.items()
         }
-        index = ExportIndex(made_from, {**known, **entries}, *split_notes(log.findings))
+        index = ExportIndex(made_from, {**exported, **entries}, *split_notes(log.findings))
     if wanted:
         write_json(out / INDEX, index)
     return _make_exported("done", index, wanted, shown, out)
@@ -163,8 +163,8 @@ def _read_index(out: Path) -> ExportIndex | None:
     return None
 
 
-def _refuse_what_is_ours(out: Path) -> None:
-    """Reject a directory inside a store or dataset, whose files are counted and sealed."""
+def _refuse_own_output(out: Path) -> None:
+    """Reject a directory of a store, dataset, map or model, whose files have checksums."""
     signs = {
         "dataset": "dataset.json", "map": "zarr.json", "model": "model.json", "cost map": "cost-map.json",
     }  # fmt: skip
@@ -175,20 +175,20 @@ def _refuse_what_is_ours(out: Path) -> None:
 
 
 def _refuse_others_files(index: ExportIndex | None, made_from: ExportOrigin, paths: Mapping[str, Path]) -> None:
-    """Reject the export of another log, and files that are not of an export."""
-    known = set[str | None]()
+    """Reject a directory with exported topics of another log, or with files that no export wrote."""
+    own = set[str | None]()
     if index is not None:
-        known = {entry.file for entry in index.topics.values()}
+        own = {entry.file for entry in index.topics.values()}
         if index.made_from.log != made_from.log:
             out = next(iter(paths.values())).parent
             raise UsageError(f"{out}: contains topics of {index.made_from.log}; give another directory")
-    foreign = [path for path in paths.values() if path.exists() and path.name not in known and not _is_a_topics(path)]
+    foreign = [path for path in paths.values() if path.exists() and path.name not in own and not _is_a_topics(path)]
     if foreign:
         raise UsageError(*(f"{path}: exists and is not an exported topic; give another directory" for path in foreign))
 
 
 def _is_a_topics(path: Path) -> bool:
-    """Return whether a file is one of `export`, which may have been interrupted before it wrote its index."""
+    """Return whether `export` wrote a file, perhaps in a call that was interrupted before it wrote its index."""
     with suppress(StoreError):
         return "topic" in read_metadata(read_schema(path).empty_table())
     return False
@@ -202,9 +202,9 @@ def _is_there(entry: IndexEntry | None, out: Path) -> bool:
 def _make_exported(
     status: Literal["done", "unchanged"], index: ExportIndex, wanted: Sequence[str], log: str, out: Path
 ) -> Exported:
-    found = {name: index.topics[name] for name in wanted}
+    entries = {name: index.topics[name] for name in wanted}
     files = tuple(
-        ExportedTopic(name, topic.type, out / topic.file, topic.rows) for name, topic in found.items() if topic.file
+        ExportedTopic(name, topic.type, out / topic.file, topic.rows) for name, topic in entries.items() if topic.file
     )
     return Exported(log, out, status, files, index.damage, index.notes, 3 if index.damage else 0)
 

@@ -1,4 +1,4 @@
-"""From logs to labelled segments in the store: one task a log, side by side, each whole or not at all."""
+"""Ingestion of logs into labelled segments of the store: parallel tasks, one a log, each complete or without effect."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -56,7 +56,7 @@ Item: TypeAlias = tuple[int, IngestTask]
 
 
 def iterate_rounds(steps: Sequence[PlannedLog]) -> list[list[Item]]:
-    """Return logs to ingest in parallel, then those of equal size: the first of equal logs names their run."""
+    """Return the logs to ingest in two rounds: logs whose size an earlier log has wait, since both may be equal."""
     sizes, rounds = set[int](), [list[Item](), list[Item]()]
     for index, step in enumerate(steps):
         if step.is_todo:
@@ -118,8 +118,8 @@ class CallOptions:
 def run_ingest(options: IngestOptions) -> IngestSummary:
     """Ingest logs (files, ROS 2 bag directories, folders of them) that the store does not have yet.
 
-    Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` if no log can be begun. The result of a log or path
-    has its own errors.
+    Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` if the call cannot begin; errors of single logs are in
+    their results.
     """
     refuse_import_of_script(options.jobs)
     opened = open_store(options.store, create=True)
@@ -144,6 +144,7 @@ ingest = as_function(IngestOptions, run_ingest)
 
 
 def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path, *, is_new: bool) -> IngestSummary:
+    """Ingest the logs of a recorded call; report and return the result of each."""
     ruling, shard, store = resolve_recipe(options.recipe), options.shard, call.store
     robot = options.robot or ruling.robot
     if robot is not None and robot not in (robots := load_profiles(ruling).robots):
@@ -151,10 +152,10 @@ def _ingest_all(call: RunningCall, options: IngestOptions, staging: Path, *, is_
     found = list_log_sources(list(options.logs), as_one=options.as_one, staging=staging, tables=ruling.tables)
     if not found.sources:
         raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
-    own = found.sources if shard is None else [found.sources[at] for at in select_shard(found.sources, shard)]
-    tasks = make_tasks(own, options, store.root, ruling)
+    sources = found.sources if shard is None else [found.sources[at] for at in select_shard(found.sources, shard)]
+    tasks = make_tasks(sources, options, store.root, ruling)
     if options.on_found:
-        sizes = {source.name: source.size_bytes for source in own}
+        sizes = {source.name: source.size_bytes for source in sources}
         options.on_found({**dict.fromkeys(map(clean_line, found.problems), 0), **sizes})
     results: dict[int, IngestResult] = {}
 
@@ -220,7 +221,7 @@ def _describe_call(summary: IngestSummary) -> dict[str, Json]:
 
 
 def _iterate_finished(state: State, steps: Sequence[PlannedLog]) -> Iterator[tuple[int, IngestResult]]:
-    """Yield the result of each log that is in the store, is known to fail, or has to wait."""
+    """Yield the result of each log that is in the store, failed before, or has to wait."""
     for index, step in enumerate(steps):
         source, made = step.task.source, step.made
         if step.failure is not None:
@@ -252,7 +253,7 @@ def _iterate_results(
 
 
 def _record_result(call: RunningCall, task: IngestTask, ended: Ingested, known: set[str]) -> IngestResult:
-    """Write the state of a log, and its failure; return its result with the state of its problems."""
+    """Record the content of a log, and its failure, in the store; return its result with the state of its problems."""
     source, result, state = ended.source, ended.result, call.state
     try:
         if result.status == "failed" and not result.transient:

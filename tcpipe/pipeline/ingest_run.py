@@ -1,4 +1,4 @@
-"""One log becomes a run of the store: read, fused, masked, cut and labelled, each file whole or not at all."""
+"""Ingestion of one log into a run of the store: read, fuse, mask, cut and label; each file is complete or missing."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -83,25 +83,25 @@ class _Read:
 
 
 def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
-    """Ingest one run; the hash of its log is left in ``hashed``, also on failure."""
+    """Ingest one run; append the hash of its log to ``hashed``, also on failure."""
     store, source = Store(task.store), task.source
     state = store.scan()
     with ExitStack() as stack:
         opened = None if source.sha256 else _open_log(task, stack)
         sha256 = _find_hash(state, opened) if opened else str(source.sha256)
         hashed.append(sha256)
-        known = [row for row in state.runs.values() if row.log.sha256 == sha256]
-        same_as = next((twin for row in known if (twin := find_twin(row, source))), None)
-        made = None if task.force else next((row for row in known if task.is_made_by(row)), None)
-        if made is not None and (not made.blob or state.has_payload(made)):
+        runs_of_log = [row for row in state.runs.values() if row.log.sha256 == sha256]
+        same_as = next((twin for row in runs_of_log if (twin := find_twin(row, source))), None)
+        stored_run = None if task.force else next((row for row in runs_of_log if task.is_made_by(row)), None)
+        if stored_run is not None and (not stored_run.blob or state.has_payload(stored_run)):
             tag_log(store, state, sha256, task.tags)
-            return make_result(source, "unchanged", made, sha256, same_as=same_as)
+            return make_result(source, "unchanged", stored_run, sha256, same_as=same_as)
         log, run_id = opened or _open_log(task, stack), name_run(state, source.stem, sha256)
         directory = stack.enter_context(store.place.workshop())
         stack.enter_context(convert_run_errors(store.place.where(), directory))
         step("reading")
         key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{RESULTS_VERSION}"
-        read = _find_stored_streams(store, state, known, task, key) or _read(log, task)
+        read = _find_stored_streams(store, state, runs_of_log, task, key) or _read(log, task)
         if read.stored is None:
             write_streams(directory, read.streams, key=key)
             files = {path.stem: path for path in (directory / STREAMS).iterdir()}
@@ -128,8 +128,8 @@ def tag_log(store: Store, state: State, sha256: str, given: Mapping[str, str]) -
 def _find_hash(state: State, log: AnyLog) -> str:
     """Return the hash that identifies a log in the store (ADR-36).
 
-    That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A
-    run with damage does not count as the same: its damaged parts may be intact here.
+    It is the log's own hash, unless a run without damage has the same outline and one of both logs was identified by it
+    alone: then it is the hash of that run. A damaged run does not count: its damaged parts may be intact here.
     """
     outline, sha256 = log.outline, log.sha256()
     for row in state.runs.values() if outline else ():
@@ -148,14 +148,14 @@ def _open_log(task: IngestTask, stack: ExitStack) -> AnyLog:
 
 
 def find_twin(known: RunFacts, source: LogSource) -> str | None:
-    """Return where else the same recording was ingested from, if it was."""
+    """Return the other path from which a run was ingested; None if it is the path of the source."""
     return None if known.log.paths == source.origins else " + ".join(known.log.paths)
 
 
 def _find_stored_streams(
     store: Store, state: State, known: Iterable[RunFacts], task: IngestTask, key: str
 ) -> _Read | None:
-    """Return the streams of a run of the same log that were made with the same settings; None without any."""
+    """Return the stored streams of the same log that were read with the same settings; None without any."""
     for row in known:
         if not task.force and row.read_key == key and row.streams_blob in state.blobs:
             streams = read_streams(store.place, row)
@@ -166,7 +166,7 @@ def _find_stored_streams(
 
 
 def _read(log: AnyLog, task: IngestTask) -> _Read:
-    """Return L1 of a log."""
+    """Read the streams of a log (level L1); `LogError` if damage leaves no message."""
     from tcpipe.stages.read import find_read_config, read_run  # noqa: PLC0415  kernels load only when there is work
 
     damage, _ = split_notes(log.findings)
@@ -238,17 +238,17 @@ def describe_recording(streams: Streams) -> Recording | None:
     if not tables:
         return None
     stamps = [to_integers(table, "stamp_ns") for table in tables.values()]
-    found = hashlib.sha256()
+    content_hash = hashlib.sha256()
     for role in _IDENTIFYING:
         if role in tables:
             names = [field.name for field in tables[role].schema if field.type in (pa.float64(), pa.int64())]
-            found.update(b"".join([role.encode(), *encode_rows(_take_first_changes(tables[role]), names)]))
-    first_ns, last_ns = min(int(each.min()) for each in stamps), max(int(each.max()) for each in stamps)
-    return Recording(first_ns, last_ns, sum(table.num_rows for table in tables.values()), found.hexdigest()[:16])
+            content_hash.update(b"".join([role.encode(), *encode_rows(_take_first_changes(tables[role]), names)]))
+    first_ns, last_ns = min(int(stamp_ns.min()) for stamp_ns in stamps), max(int(stamp_ns.max()) for stamp_ns in stamps)
+    return Recording(first_ns, last_ns, sum(table.num_rows for table in tables.values()), content_hash.hexdigest()[:16])
 
 
 def _take_first_changes(table: pa.Table) -> pa.Table:
-    """Return the first rows with other values than the row before: each robot that rests gives the same ones."""
+    """Return the first rows that differ from the row before: rows of a stationary robot are alike for every log."""
     is_new = np.zeros(table.num_rows, bool)
     is_new[0] = True
     for field in table.schema:
@@ -293,8 +293,8 @@ def run_stages(
 ) -> tuple[Track, MaskedTrack, LabelledSegments]:
     """Run fuse, gate, segment and label over the streams of one run.
 
-    A stage gets its own section, and of the others nothing but the chord; no section that `recipe_id` is not the hash
-    of is in reach.
+    Each stage gets only its own section of the recipe, and the chord. All of these sections are part of the hash
+    `recipe_id`.
     """
     from tcpipe.stages.fuse import fuse_run  # noqa: PLC0415  kernels load only when there is work
     from tcpipe.stages.label import label_segments  # noqa: PLC0415

@@ -46,7 +46,7 @@ class InspectedRecipe(RunFacts):
     """A run under one recipe: its facts, and the verdict by the catalogue of this version."""
 
     counts: Counts
-    verdict: Verdict = field()  # else its default were the property of `RunFacts`
+    verdict: Verdict = field()  # else the property of `RunFacts` would be its default
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,6 +149,7 @@ def inspect(
 
 
 def _inspect_url(url: str, ask: Callable[[Location], InspectedLog]) -> Inspected:
+    """Inspect a log, store or dataset at a URL, or all logs below it."""
     if is_presigned(url):
         return ask(url)
     if not is_log_file(url):  # the rest of a log need not be readable

@@ -53,7 +53,7 @@ class StampCounts:
 class InspectedTopic:
     """Facts of a topic from the index, and, if all messages are read, from these.
 
-    Facts that need all messages are None without.
+    Facts that need all messages are None if only the index was read.
     """
 
     name: str
@@ -65,7 +65,7 @@ class InspectedTopic:
     """Why it is used as its role, or is not used."""
     stamps: StampCounts | None = omit()
     wrong_stamps: int | None = omit()
-    """Stamps beside zero that were replaced."""
+    """Number of stamps other than zero that were replaced."""
     time: Literal["header", "log"] | None = omit()
     """Which stamps are used."""
     time_why: str | None = omit()
@@ -103,8 +103,8 @@ def inspect_log(
 ) -> InspectedLog:
     """Return the content of a log.
 
-    With ``full`` every message is read: counts, gaps, stamps, clock steps and damage; with ``reads_roles`` those of the
-    used topics, for the proposed recipe.
+    With ``full``, every message is read for counts, gaps, stamps, clock steps and damage; with ``reads_roles``, only
+    the messages of used topics, for the proposed recipe.
     """
     known = load_profiles(recipe)
     config = find_read_config(recipe, log.topics)
@@ -166,21 +166,21 @@ def _read(
     log: Log | TableLog, topics: tuple[InspectedTopic, ...]
 ) -> tuple[tuple[InspectedTopic, ...], tuple[ClockStep, ...]]:
     """Read every message; return the topics with the facts of their messages, and the clock epochs."""
-    found: dict[str, TopicStamps] = {}
+    facts: dict[str, TopicStamps] = {}
     for tables in log.batches(sorted(log.topics)):
         for name, table in tables.items():
-            found.setdefault(name, TopicStamps()).add(table)
-    times = {name: stamps.topic_times() for name, stamps in found.items()}
+            facts.setdefault(name, TopicStamps()).add(table)
+    times = {name: stamps.topic_times() for name, stamps in facts.items()}
     clocks = {
         name: stamps for name, stamps in times.items() if stamps.header_ns is not None and len(stamps.log_time_ns)
     }
     published = any(topic.type_name == CLOCK and topic.message_count for topic in log.topics.values())
     settled = settle_clocks(clocks, clock_published=published)
     clock = settled.simulated
-    counting = clock.topics if clock is not None and clock.find_simulated_time() else frozenset()
+    simulated = clock.topics if clock is not None and clock.find_simulated_time() else frozenset()
     read = tuple(
-        _add_stamps(topic, found[topic.name], settled.timelines.get(topic.name), simulated=topic.name in counting)
-        if topic.name in found
+        _add_stamps(topic, facts[topic.name], settled.timelines.get(topic.name), simulated=topic.name in simulated)
+        if topic.name in facts
         else topic
         for topic in topics
     )
@@ -190,7 +190,7 @@ def _read(
 def _add_stamps(
     topic: InspectedTopic, stamps: TopicStamps, timeline: TopicTimeline | None, *, simulated: bool
 ) -> InspectedTopic:
-    """Return a topic with statistics of its messages; without a timeline they have no header."""
+    """Return a topic with statistics of its messages; ``timeline`` is None if these have no header."""
     counts = stamps.counts()
     if timeline is None:
         return replace(topic, stamps=counts)
@@ -298,18 +298,18 @@ class TopicStamps:
 
 
 def _find_repeated_rows(table: pa.Table, rows: Ints) -> Mask:
-    """Return which of the rows repeat the row before exactly, times of the log aside, shape (len(rows),)."""
+    """Mark the given rows that repeat the row before exactly, except in times of the log, shape (len(rows),)."""
     same = np.ones(len(rows), bool)
     for column in table.columns[_TIMES:]:
-        left = np.flatnonzero(same)
-        if not len(left):
+        undecided = np.flatnonzero(same)
+        if not len(undecided):
             break
-        own, before = (column.take(rows[left] - back).combine_chunks() for back in (0, 1))
+        own, before = (column.take(rows[undecided] - back).combine_chunks() for back in (0, 1))
         if pa.types.is_primitive(column.type) and not pa.types.is_boolean(column.type):
             values = [
                 np.ascontiguousarray(column.to_numpy()).view(f"V{column.type.byte_width}") for column in (own, before)
             ]
-            same[left] = values[0] == values[1]  # bit by bit: a NaN equals itself
+            same[undecided] = values[0] == values[1]  # bit by bit: a NaN equals itself
         else:
-            same[left] = [own.slice(row, 1).equals(before.slice(row, 1)) for row in range(len(left))]
+            same[undecided] = [own.slice(row, 1).equals(before.slice(row, 1)) for row in range(len(undecided))]
     return same

@@ -103,7 +103,7 @@ class LogSource:
 
 @dataclass(frozen=True, slots=True)
 class FoundLogs:
-    """The logs at or below the paths given, each once, in the order given, and a line for each path that holds none."""
+    """The logs at or below the given paths, each once and in that order, and a line for each path without a log."""
 
     sources: tuple[LogSource, ...]
     problems: Mapping[str, tuple[str, ...]]
@@ -117,8 +117,8 @@ def list_log_sources(
 ) -> FoundLogs:
     """Return the logs at or below the given paths.
 
-    With ``as_one`` they are all parts of one. Logs in object storage get placeholders in ``staging``. A folder with one
-    of the files of ``tables`` is a log; if their names have a ``*``, the files of each run are one log.
+    With ``as_one``, all of them are parts of one log. Logs in object storage get placeholders in ``staging``. A folder
+    with one of the files of ``tables`` is a log; if their names have a ``*``, the files of each run are one log.
     """
     paths: dict[str, list[tuple[Path, str]]] = {}
     urls: dict[Path, str] = {}
@@ -180,15 +180,15 @@ def find_logs_at(path: Path, tables: Mappings) -> list[tuple[Path, ...]]:
 
 
 def _find_lone_parts(paths: Iterable[Path], *, together: bool) -> Iterator[tuple[Path, str]]:
-    """Yield files that are parts of a ROS 2 bag without its others: only the first part has static transforms."""
+    """Yield ROS 2 bag files that are given without the rest of their bag: only the first has static transforms."""
     folders: dict[str, list[Path]] = {}
     for path in paths:
         if str(path).endswith(STORAGE_SUFFIXES):
             folders.setdefault(os.path.dirname(path), []).append(path)  # noqa: PTH120  of thousands
-    for bag, mine in sorted(folders.items()):
+    for bag, given_parts in sorted(folders.items()):
         parts = frozenset(list_storage_files(Path(bag)) if is_one_bag(Path(bag)) else ())
-        if len(parts) > 1 and not (together and parts.issubset(mine)):
-            for path in sorted(parts.intersection(mine)):
+        if len(parts) > 1 and not (together and parts.issubset(given_parts)):
+            for path in sorted(parts.intersection(given_parts)):
                 what = f"{path}: is one of the {len(parts)} parts of the ROS 2 bag {bag}"
                 yield path, f"{what}, and only the first part has the static transforms; give the directory"
 
@@ -220,7 +220,7 @@ def find_remote_logs(url: str, directory: Path) -> dict[Path, str]:
 
 
 def _as_named(path: Path) -> Path:
-    """Return a log's path in full, as the user names it; links above a ``..`` are followed."""
+    """Return a log's full path with links as the user wrote them; only links before a ``..`` are followed."""
     if ".." not in path.parts:
         return path.absolute()
     return path.resolve() if path.name == ".." else path.parent.resolve() / path.name
@@ -238,15 +238,15 @@ def _list_file_states(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
 
 
 def _stat_files(path: Path) -> list[os.stat_result]:
-    """Return the file system's entries of a file, or of all files below a directory, without unreadable ones."""
+    """Return the status of a file, or of all regular files below a directory, without unreadable ones."""
     try:
-        seen = os.stat(path)  # noqa: PTH116
+        status_of_path = os.stat(path)  # noqa: PTH116
     except OSError:
         return []
-    if stat.S_ISDIR(seen.st_mode):
+    if stat.S_ISDIR(status_of_path.st_mode):
         names = (f"{place}/{name}" for place, _, names_in_folder in walk_folders(path) for name in names_in_folder)
         return [status for file in sorted(names) if stat.S_ISREG((status := os.stat(file)).st_mode)]  # noqa: PTH116
-    return [seen] if stat.S_ISREG(seen.st_mode) else []
+    return [status_of_path] if stat.S_ISREG(status_of_path.st_mode) else []
 
 
 def recall_hash(source: LogSource, seen: LogSnapshot | None) -> LogSource:

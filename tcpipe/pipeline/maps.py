@@ -29,7 +29,7 @@ from tcpipe.terrain.layers import ClassScheme, find_wrong_name
 
 ROLES = ("height", "ortho", "terrain", "classes")
 CLASSES = "classes"
-"""Role of a class table, and behind a layer's name that of the layer's own."""
+"""Role of a class table; the role of a layer's own table is the name of the layer followed by this word."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +65,7 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
 
 
 def _add_map(call: RunningCall, options: AddMapOptions) -> AddedMap:
+    """Add a map to the store of a recorded call, unless it is there and was made from the same inputs."""
     name, layers, categorical = check_map_name(options.name), options.layer or {}, options.categorical or {}
     _refuse_layers(layers, categorical, ortho=bool(options.ortho), ortho_bands=options.ortho_bands)
     given = {role: getattr(options, role) for role in ROLES}
@@ -127,8 +128,8 @@ def _refuse_layers(
 
 
 def _make_added(store: Store, record: StoredMap, status: Literal["done", "unchanged"]) -> AddedMap:
-    found = open_map(*store.map_at(record)).summary()
-    return AddedMap(store.place.where(record.zarr), status, found, store.place.where(record.picture))
+    summary = open_map(*store.map_at(record)).summary()
+    return AddedMap(store.place.where(record.zarr), status, summary, store.place.where(record.picture))
 
 
 def _find_files(given: Mapping[str, Files]) -> dict[str, list[Path]]:
@@ -185,10 +186,10 @@ def _compute_checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[st
 def _find_unchanged(store: Store, state: State, name: str, inputs: MapInputs) -> AddedMap:
     """Return the existing map; `MapError` with the differences if it was made from other inputs."""
     try:
-        found = open_map(*store.map_at(state.maps[name]))
+        stored = open_map(*store.map_at(state.maps[name]))
     except (MapError, StoreError) as error:
         raise MapError(*error.problems, f"map {name}: add it again with --force") from None
-    before = found.facts.inputs
+    before = stored.facts.inputs
     roles = dict.fromkeys([*ROLES, *before.files, *inputs.files])
     changes = [_describe_change(role, before.files.get(role, {}), inputs.files.get(role, {})) for role in roles]
     changes = [change for change in changes if change]
@@ -223,12 +224,12 @@ def _find_common_classes(store: Store, state: State, name: str) -> ClassScheme |
         if other == name:
             continue
         try:
-            found = open_map(*store.map_at(record))
+            saved = open_map(*store.map_at(record))
         except (MapError, StoreError):
             logger.warning("map %s cannot be read; its classes are not compared", other)
             continue
-        if found.facts.classes_from == "file" or ("terrain" in found.layers and found.facts.classes_from != "default"):
-            own = found.facts.classes_from == "names"  # the values belong to that raster alone
-            values = {entry.id: entry.id for entry in found.classes.classes} if own else found.id_by_value
-            return ClassScheme(found.classes, values)
+        if saved.facts.classes_from == "file" or ("terrain" in saved.layers and saved.facts.classes_from != "default"):
+            is_named = saved.facts.classes_from == "names"  # the values belong to that raster alone
+            values = {entry.id: entry.id for entry in saved.classes.classes} if is_named else saved.id_by_value
+            return ClassScheme(saved.classes, values)
     return None

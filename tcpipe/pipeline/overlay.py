@@ -66,9 +66,9 @@ class Overlay:
 def write_overlay(name: str, out: Path, *, store: Location = "tcpipe-store") -> Overlay:
     """Write the results of a run as an MCAP file of ROS 2 messages, atomically; the same run gives the same bytes.
 
-    `UsageError`: there is no run of this name (RUN or RUN/RECIPE), or it is under several recipes, or ``out`` is there
-    and no overlay: a recording is never replaced; `StoreError`: a file of the run, or its streams, which know the
-    recorder's clock, is not as it was written.
+    `UsageError`: no run has this name (RUN or RUN/RECIPE), or it has several recipes, or ``out`` exists and is not an
+    overlay: a log is never replaced. `StoreError`: a file of the run, or its streams, which have the times of the
+    recorder's clock, has been changed.
     """
     run = find_named_run(name, store)
     _refuse_others(out)
@@ -134,12 +134,12 @@ class _Clock:
             epoch = self._epoch_of(stamp_ns)
         times = stamp_ns.copy()
         for number in np.unique(epoch):
-            mine, known = epoch == number, self._epoch == number
-            known = known if known.any() else np.ones_like(known)
-            begin = self._stamp_ns[known][0]  # differences are exact in float64, times since 1970 are not
-            at_ns = (stamp_ns[mine] - begin).astype(float)
-            known_ns = (self._stamp_ns[known] - begin).astype(float)
-            times[mine] += np.rint(np.interp(at_ns, known_ns, self._behind_ns[known])).astype(np.int64)
+            in_epoch, is_usable = epoch == number, self._epoch == number
+            is_usable = is_usable if is_usable.any() else np.ones_like(is_usable)
+            begin = self._stamp_ns[is_usable][0]  # differences are exact in float64, times since 1970 are not
+            at_ns = (stamp_ns[in_epoch] - begin).astype(float)
+            known_ns = (self._stamp_ns[is_usable] - begin).astype(float)
+            times[in_epoch] += np.rint(np.interp(at_ns, known_ns, self._behind_ns[is_usable])).astype(np.int64)
         return times
 
     def _epoch_of(self, stamp_ns: Ints) -> Ints:
@@ -171,7 +171,7 @@ def _add_bit_names(table: pa.Table, column: str, flags: type[DropReason | Qualit
 
 
 def _make_fixes(rows: pa.Table, times: Ints) -> MessageStream:
-    """Return the track as NavSatFix, in the datum of the log's own fixes, its variances beside."""
+    """Return the track as NavSatFix messages with variances, in the datum of the fixes of the log."""
     columns = make_stamp_fields(_read_column(rows, "stamp_ns"))
     columns |= {
         name: _read_column(rows, f"{name[:3]}_{unit}")
@@ -184,7 +184,7 @@ def _make_fixes(rows: pa.Table, times: Ints) -> MessageStream:
 
 
 def _iterate_masks(reasons: Texts, times: Ints) -> Iterator[MessageStream]:
-    """Yield why rows are not used, a message where that changes."""
+    """Yield the reasons why rows are masked, as a message at each change."""
     changes = np.flatnonzero(np.append(True, reasons[1:] != reasons[:-1])[: len(reasons)])
     for reason in np.unique(reasons):
         at = times[changes[reasons[changes] == reason]]
@@ -192,7 +192,7 @@ def _iterate_masks(reasons: Texts, times: Ints) -> Iterator[MessageStream]:
 
 
 def _iterate_messages(name: str, stamp: str, table: pa.Table, times: Ints) -> Iterator[MessageStream]:
-    """Yield rows of a table as messages of an own type: a field per column, null as NaN, by lengths of texts."""
+    """Yield a table as messages of an own type, one field per column, grouped by lengths of texts; null becomes NaN."""
     kinds = {field.name: _ROS_TYPES[field.type] for field in table.schema}
     definition = "std_msgs/Header header\n" + "".join(f"{kind} {column_name}\n" for column_name, kind in kinds.items())
     columns: dict[str, AnyArray] = {**make_stamp_fields(_read_column(table, stamp))}

@@ -1,4 +1,4 @@
-"""Tasks and results of ``ingest``, and the decision for each log, which ``--dry-run`` and ``status`` show, too."""
+"""Tasks and results of ``ingest``, and the state and next step of each log, which ``--dry-run`` and ``status`` show."""
 
 import time
 import traceback
@@ -27,7 +27,7 @@ Status = Literal["done", "unchanged", "damaged", "empty", "failed", "waiting"]
 
 @dataclass(frozen=True, slots=True)
 class IngestTask:
-    """One run to make: the log and how."""
+    """A log to ingest, and the settings for it."""
 
     source: LogSource
     store: Location
@@ -113,7 +113,7 @@ def make_result(source: LogSource, status: Status, made: RunFacts, sha256: str, 
 
 
 def check_age(task: IngestTask, now_ns: int | None = None) -> IngestResult | None:
-    """Return the result that a log has to wait; None if it has not."""
+    """Return the result of a log that is too young and has to wait, else None."""
     youngest_ns = max((time_ns for _, time_ns in task.source.files), default=0)
     age_s = ((time.time_ns() if now_ns is None else now_ns) - youngest_ns) / 1e9
     if not task.source.files or age_s >= task.min_age_s or not task.min_age_s:
@@ -130,10 +130,10 @@ def make_died_result(source: LogSource) -> IngestResult:
 
 
 def mark_reported(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
-    """Do something with a log; an error becomes its result."""
+    """Apply a function to a task; return an error as the result of its log."""
     try:
         return act(task)
-    except Exception as error:  # noqa: BLE001  at last a bug that one log meets
+    except Exception as error:  # noqa: BLE001  also internal errors, so that other logs go on
         for line in "".join(traceback.format_exception(error)).splitlines():
             logger.debug("%s: %s", task.source.name, line)
         problems, trace = _format_error(error, task.source)
@@ -201,7 +201,7 @@ class PlannedLog:
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """A state by content."""
+    """Runs and failures of a store by the hash of their log, and temporary failures by the name of their log."""
 
     state: State
     acknowledged: Collection[str]
@@ -224,6 +224,7 @@ def plan_ingestion(tasks: Iterable[IngestTask], state: State) -> tuple[PlannedLo
 
 
 def _decide(task: IngestTask, known: _Known, now_ns: int) -> PlannedLog:  # noqa: PLR0911  one for each state
+    """Return the state of a log and the next step for it."""
     if not task.force:
         task = replace(task, source=recall_hash(task.source, known.state.find_seen(task.source.origins)))
     source, sha256 = task.source, None if task.force else task.source.sha256
@@ -238,7 +239,7 @@ def _decide(task: IngestTask, known: _Known, now_ns: int) -> PlannedLog:  # noqa
         cause = _remove_name("".join(failed.problems[:1]), task)
         state: LogState = "quarantined" if is_acknowledged else "failed_permanent"
         return PlannedLog(task, state, cause, failure=failed, findings=failed.findings)
-    if source.name in known.passing:  # it was old enough then
+    if source.name in known.passing:  # it was old enough before
         return PlannedLog(task, "failed_transient", _remove_name(known.passing[source.name], task))
     if check_age(task, now_ns):
         return PlannedLog(task, "growing")
@@ -252,7 +253,7 @@ def _decide(task: IngestTask, known: _Known, now_ns: int) -> PlannedLog:  # noqa
 
 
 def _stand(task: IngestTask, made: RunFacts, known: _Known) -> PlannedLog:
-    """Return the step of a log that is in the store as it would be made now."""
+    """Return the state of a log whose run in the store is up to date."""
     if not made.blob:
         return PlannedLog(task, "superseded", "its run was pruned; --force ingests it again", made)
     if made.superseded_by:
@@ -299,10 +300,10 @@ def _describe_outdated(made: RunFacts, task: IngestTask) -> str:
 
 def list_transient_failures(calls: Sequence[Call]) -> dict[str, str]:
     """Return the logs whose latest failure may be temporary, with the failure; ``calls`` begin with the latest."""
-    found: dict[str, str] = {}
+    failures: dict[str, str] = {}
     for call in reversed(calls):
-        found.update(call.failed)
-    return found
+        failures.update(call.failed)
+    return failures
 
 
 def _remove_name(line: str, task: IngestTask) -> str:

@@ -155,9 +155,9 @@ def preflight(
 ) -> Preflight:
     """Predict the result of recording in the same way.
 
-    ``log`` is a minute or more, of any container, or the URL of one, of a folder of logs the first; all of it is read.
-    The rest is as `tcpipe.pipeline.ingest.ingest` takes it. `LogError`, `RecipeError`: it is no log, or cannot be read
-    at all.
+    ``log`` is a path or URL of a log of at least a minute, all of which is read; of a folder, the first log is used.
+    The other parameters are those of `tcpipe.pipeline.ingest.ingest`. `LogError`, `RecipeError`: there is no log, or it
+    cannot be read.
     """
     recipe = resolve_recipe(recipe)
     robot = robot or recipe.robot
@@ -209,6 +209,7 @@ def _summarize(
 
 
 def _estimate_yield(labelled: LabelledSegments) -> ExpectedYield:
+    """Return the yield of an excerpt per hour of recording and of driving."""
     facts, distance_by_reason_m = labelled.info.report.facts, labelled.distance_by_reason_m
     cut, label = facts.segment, facts.label
     seconds = cut.duration_by_reason_s if cut else {}
@@ -249,20 +250,20 @@ def _iterate_topics(facts: StageFacts, span_s: float) -> Iterator[RoleTopic]:
 
 
 def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:
-    """Yield a warning for each role without a topic while it can be recorded; none if the recipe does without the role.
+    """Yield a warning for each role without a topic, unless the recipe does without it; the role could be recorded.
 
-    Without GNSS or power there is no sample: these are reported for every recipe.
+    Without GNSS or power there are no samples: they are reported for every recipe.
     """
     present = {*roles, "gnss"} if "pose" in roles else {*roles}
     for code, role in {**MISSING, "no-command": "command"}.items():
         is_needless = role not in ("gnss", "power") and read.topics.get(cast("Role", role)) == []
         if role not in present and not is_needless:
-            found = make_finding(code, Subject("role", role))
-            yield replace(found, severity="warning") if found.severity == "note" else found
+            finding = make_finding(code, Subject("role", role))
+            yield replace(finding, severity="warning") if finding.severity == "note" else finding
 
 
 def find_slow(topics: Sequence[RoleTopic], expected_yield: ExpectedYield | None, span_s: float) -> Iterator[Finding]:
-    """Yield findings on topics that are too slow, or absent for a part of the time, and on a log that is too short."""
+    """Yield findings on topics that are slow or absent for a part of the time, and on a log that is too short."""
     for topic in topics:
         subject, names = Subject("role", topic.role), {"topic": topic.topic}
         least_hz = read_threshold("rate-too-low", "min_rate_fraction") * (topic.wanted_hz or 0.0)

@@ -102,30 +102,28 @@ def find_stale_outputs(store: Store, state: State) -> Iterator[Problem]:
 def acknowledge(names: Sequence[str], *, store: Location = "tcpipe-store") -> Acknowledged:
     """Acknowledge problems of runs, logs, datasets and killed calls: no exit code 3 until their content changes.
 
-    A run whose tables are missing is no longer expected. A killed call counts as ended.
-
-    Raises `StoreError`: there is no store, or it cannot be written; `UsageError`: a name is not that of one run, log or
-    dataset with a problem; nothing is acknowledged then.
+    A run whose tables are missing is no longer expected, and a killed call counts as ended. Raises `StoreError`: there
+    is no store, or it cannot be written; `UsageError`: a name does not fit one run, log or dataset with problems.
     """
     opened = open_store(store)
     with record_call(opened, ACKNOWLEDGE, names) as call:
         state = call.state
         known = {problem.key: problem for problem in (*find_known_problems(state), *find_stale_outputs(opened, state))}
-        chosen, wrong = dict[str, Problem](), list[str]()
+        chosen, unmatched = dict[str, Problem](), list[str]()
         for name in dict.fromkeys(names):
-            found = (
+            matches = (
                 _name_problems(name, known.values(), state)
                 or list(find_incomplete_runs(state, name))
                 or list(find_incomplete_maps(state, name))
                 or _make_missing_problem(name, state)
             )
-            if len({problem.name for problem in found}) == 1:
-                chosen |= {problem.key: problem for problem in found}
+            if len({problem.name for problem in matches}) == 1:
+                chosen |= {problem.key: problem for problem in matches}
             else:
                 candidates = [problem for problem in known.values() if problem.key not in state.acknowledged]
-                wrong.append(_describe_no_match(name, found, candidates, state, opened.root))
-        if wrong:
-            raise UsageError(*wrong)
+                unmatched.append(_describe_no_match(name, matches, candidates, state, opened.root))
+        if unmatched:
+            raise UsageError(*unmatched)
         before = state.acknowledged
         now = tuple(problem for key, problem in chosen.items() if key not in before)
         for problem in now:

@@ -110,7 +110,7 @@ class ProposedRecipe:
 def propose_lines(
     tables: Mapping[str, Keys | Sequence[Keys]], notes: Mapping[str, str], doubt: str
 ) -> Iterator[ProposedLine]:
-    """Yield the lines of a remedy's tables; ``notes`` are by name of a key or array, ``doubt`` is left to the user."""
+    """Yield the lines of a remedy; ``notes`` are by key or array name, ``doubt`` is a decision for the user."""
     for table, keys in tables.items():
         if not isinstance(keys, Mapping):
             yield ProposedLine("", table, keys, "; ".join(filter(None, [notes.get(table), doubt])), not doubt)
@@ -122,7 +122,7 @@ def propose_lines(
 
 
 def propose_places(frames: Iterable[tuple[str, str]]) -> Iterator[ProposedLine]:
-    """Yield a line for each sensor whose place on the robot must be measured; ``frames``: pairs of role and frame."""
+    """Yield a line for each sensor whose extrinsics must be measured; ``frames`` are pairs of role and frame."""
     for role, frame in frames:
         note = f"measure it from base_link: nothing places {frame or 'it'}"
         yield ProposedLine("read.extrinsics", role, make_place_to_measure(role), note, is_certain=False)
@@ -134,9 +134,9 @@ _CODES_NOTE = "if these are its codes; else rtklib, ublox, mavlink, navsat, gps_
 def propose_recipe(
     path: Location, *, robot: str | None = None, message_definitions: Path | None = None
 ) -> ProposedRecipe:
-    """Return the recipe for a log, or the first of a folder's, or the tables in a folder, ignoring existing recipes.
+    """Return the recipe for a log, for the first log of a folder, or for the tables in a folder without logs.
 
-    Raises `LogError`, `UsageError`: there is no readable log.
+    The recipes in use are ignored. Raises `LogError`, `UsageError`: there is no readable log.
     """
     path, others, recipe = path if is_url(path) else Path(path), list[str](), Recipe()
     if isinstance(path, Path) and (is_store(path) or (path / "dataset.json").is_file()):
@@ -162,8 +162,8 @@ def propose_for_log(
 ) -> ProposedRecipe:
     """Return the recipe for a log, as ``init --from`` writes it: keys that the current recipe does not define.
 
-    ``proposals`` are what `find_proposals` finds in it. Unless it ``is_complete``, values are those of the first
-    messages, and extrinsics from moving transforms are left out.
+    ``proposals`` come from `find_proposals`. With ``is_complete``, all messages are read; otherwise values are from the
+    first messages, without extrinsics from moving transforms.
     """
     config = find_read_config(recipe, log.topics)
     used = {name: role for role, names in assigned.choices.items() for name in names}
@@ -203,8 +203,7 @@ def propose_for_log(
     unplaced = [
         (role, frames[role]) for role, (_, by) in places.items() if by == "assumed" and role != "wheel_odometry"
     ]
-    is_placed = is_complete or {*assigned.transforms} <= {*static}
-    lines += propose_places(unplaced if is_placed else ())
+    lines += propose_places(unplaced if is_complete or {*assigned.transforms} <= {*static} else ())
     return ProposedRecipe([*head, "", "These need no line."], lines, str(log.path))
 
 
@@ -216,7 +215,7 @@ def _format_ranges(numbers: Mapping[str, float]) -> str:
 
 
 def _iterate_questions(assigned: RoleAssignment, log: Log | TableLog) -> Iterator[ProposedLine]:
-    """Yield the lines for roles that several topics could be used as, and for a command that no name shows."""
+    """Yield the lines for roles with several possible topics, and for a command topic that no name identifies."""
     for role, names in assigned.choices.items():
         others = " or ".join(f'["{name}"]' for name in names[1:])
         yield ProposedLine("read.topics", role, [names[0]], f"or {others}", is_certain=False)
@@ -236,7 +235,7 @@ def _describe_sample(columns: Columns, topic: Topic, role: str) -> str:
     return count + "".join(f", {name} {format_first(columns[message])}" for name, message in shown[-3:])
 
 
-# By key of a table of the recipe its value, a note, and whether it is certain.
+# Value, note and certainty of each key of one of the recipe's tables.
 _Values: TypeAlias = dict[str, tuple[TomlValue, str, bool]]
 _STAMP = re.compile(
     r".*time(stamp|string)?(_(utc|local))?|(.*_)?(t|stamp|gpst|utc|date|epoch|millis|micros|ms_today|ms_of_day)|ms|us"
@@ -288,8 +287,8 @@ class _Table:
 def propose_tables(path: Path) -> ProposedRecipe:
     """Return the recipe for tables with known names; its head lists their columns and the unreadable ones.
 
-    Of several tables for a role, that is used which covers the drive of the others best. Tables that contradict others
-    in the first minute are comments.
+    Of several tables for a role, the one that shares most time with the others is used. Tables that contradict others in
+    the first minute become comments.
     """
     from tcpipe.formats.logs.table_log import read_table_header  # noqa: PLC0415  polars only where a table is read
 
@@ -428,7 +427,7 @@ def _make_lines(table: _Table, name: str, role: str, columns: Mapping[str, str],
 
 
 def _list_lacking(role: str, fields: Collection[str]) -> list[str]:
-    """Return the fields that a role needs and does not have; of power one of two."""
+    """Return the fields that a role needs and that are missing; power needs at least one of voltage and current."""
     needed = [field for field, known in MAPPED[role].items() if known.needed and field not in fields]
     return needed if fields or needed else ["voltage", "current"]
 
@@ -438,28 +437,28 @@ _TIMES_RADIUS = " * 0.1"  # end of a speed by revolutions, for wheels with a rad
 
 
 def _read_values(table: _Table, role: str, columns: Mapping[str, str]) -> tuple[dict[str, Floats], dict[str, str]]:
-    """Return values of columns by field in its unit, without columns that have no number, and the units to state.
+    """Return the values of fields in their units, without columns that have no numbers, and the units to state.
 
-    These are the units of expressions whose columns have another one than the field.
+    A unit must be stated for an expression whose columns have another unit than the field.
     """
-    found, units = dict[str, Floats](), dict[str, str]()
+    values, units = dict[str, Floats](), dict[str, str]()
     for field, text in columns.items():
         unit, expression = MAPPED[role][field].unit, parse_expression(text, table.names)
-        other = None if expression.column else find_other_unit(expression, unit)
-        units |= {field: other if other in UNITS[unit] else unit} if other else {}
+        other_unit = None if expression.column else find_other_unit(expression, unit)
+        units |= {field: other_unit if other_unit in UNITS[unit] else unit} if other_unit else {}
         read = read_fields("", role, {field: text}, units, table.names)
         if field == "quality":
-            found[field] = np.zeros(1)
+            values[field] = np.zeros(1)
         elif isinstance(read, dict) and {name for name, _ in expression.operands()} <= table.numbers.keys():
             rows = len(next(iter(table.numbers.values())))
-            found[field] = read[field].evaluate(lambda name, _: table.numbers[name], rows)
-    return found, units
+            values[field] = read[field].evaluate(lambda name, _: table.numbers[name], rows)
+    return values, units
 
 
 def _judge_values(
     role: str, mapped: Mapping[str, str], values: Mapping[str, Floats]
 ) -> tuple[dict[str, str], str] | None:
-    """Return the columns with the factors that their values show, and the doubts; None if they are no power."""
+    """Return the columns with factors that their values suggest, and doubts; None if they are not a power."""
     if role in ("gnss", "imu"):
         judged, doubt = judge_fields(role, {field: quote(text) for field, text in mapped.items()}, values)
         return {field: mapped[field] if text == quote(mapped[field]) else text for field, text in judged.items()}, doubt
@@ -473,7 +472,7 @@ def _judge_values(
 
 
 def _propose_rest(role: str, tables: Sequence[_Table], used: str) -> Iterator[ProposedLine]:
-    """Yield the table of a role that was not found as comments, for the first likely column, with three values."""
+    """Yield a table for a role that was not found, as comments, for the first file with likely columns."""
     units = {unit for field in MAPPED[role].values() if field.unit not in ("1", "m") for unit in UNITS[field.unit]}
     for table in tables:
         stamp = table.stamp_lines["stamp"][0]

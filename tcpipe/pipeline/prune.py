@@ -1,8 +1,8 @@
 """Removal of replaced documents, given-up runs and unnamed payload from a store; datasets are not changed.
 
-A removal is safe beside other calls (ADR-36): only documents that did not count in a first scan go, and only payload
-that was listed before a second scan and that no document of this scan names. Nothing is removed while another call may
-run.
+Removal is safe while other calls start (ADR-36): it removes only documents that were replaced at a first scan, and only
+payload that was listed before a second scan and that no document of that scan names. It removes nothing while another
+call may be running.
 """
 
 from collections import Counter
@@ -129,10 +129,10 @@ _Chosen = dict[str, tuple[RunFacts, str]]  # by key: a run whose tables are remo
 
 def _choose_named(store: Store, state: State, names: Sequence[str]) -> _Chosen:
     """Return the runs called RUN or RUN/RECIPE; `UsageError` if one does not exist."""
-    found = {name: name.partition("/")[::2] for name in names}
+    parts = {name: name.partition("/")[::2] for name in names}
     rows = {
         name: [row for row in state.list_rows(run_id) if recipe_id in ("", row.recipe_id)]
-        for name, (run_id, recipe_id) in found.items()
+        for name, (run_id, recipe_id) in parts.items()
     }
     if unknown := [name for name in names if not rows[name]]:
         raise UsageError(*(f"{name}: no run of {store.root} has this name; nothing is removed" for name in unknown))
@@ -158,14 +158,14 @@ def _make_key(row: RunFacts) -> str:
 
 
 def _find_references(state: State, forgotten: Collection[str]) -> dict[tuple[str, str], str]:
-    """Return the runs and recipes that outputs are made of, and why each stays."""
-    found = dict[tuple[str, str], str]()
+    """Return the runs and recipes from which outputs are made, each with the reason to keep it."""
+    references = dict[tuple[str, str], str]()
     for output in state.outputs.values():
         inputs = None if output.where in forgotten or not output.runs else _read_inputs(output.where)
         if output.where not in forgotten and inputs in (None, output.inputs):
             hint = f"; if it no longer exists: 'tcpipe prune --forget {output.where}'" if inputs is None else ""
-            found |= dict.fromkeys(output.runs, f"dataset {output.where} refers to it{hint}")
-    return found
+            references |= dict.fromkeys(output.runs, f"dataset {output.where} refers to it{hint}")
+    return references
 
 
 def _read_inputs(where: str) -> str | None:
@@ -197,11 +197,11 @@ class _Removal:
     kept: list[Leftover] = field(default_factory=list)
 
     def give_up(self, chosen: _Chosen) -> None:
-        """Write that runs have no tables, but those to which an output refers."""
-        held = _find_references(self.first, self.forgotten) if chosen else {}
+        """Record that runs have no tables, except runs to which an output refers."""
+        references = _find_references(self.first, self.forgotten) if chosen else {}
         for key, (row, what) in chosen.items():
-            if why := held.get((row.run_id, row.recipe_id)):
-                self.kept.append(_describe(row, what, why))
+            if reason := references.get((row.run_id, row.recipe_id)):
+                self.kept.append(_describe(row, what, reason))
                 continue
             document = self.first.names["runs", key]
             try:
@@ -215,15 +215,15 @@ class _Removal:
     def take_back(self, second: State, *, is_all: bool) -> None:
         """Restore runs if a new output refers to them, or if nothing can be removed now."""
         self.forgotten = [name for name in self.forgotten if self.first.outputs[name] == second.outputs.get(name)]
-        held = _find_references(second, self.forgotten) if self.chosen else {}
+        references = _find_references(second, self.forgotten) if self.chosen else {}
         for key, (row, what) in [*self.chosen.items()]:
-            why = held.get((row.run_id, row.recipe_id))
-            if is_all or why is not None:
+            reason = references.get((row.run_id, row.recipe_id))
+            if is_all or reason is not None:
                 del self.chosen[key]
-                self.kept += [_describe(row, what, why)] if why else []
-                earlier = self.earlier.pop(key)
+                self.kept += [_describe(row, what, reason)] if reason else []
+                document = self.earlier.pop(key)
                 if not self.dry_run:
-                    self.store.put_run(second, read_record(self.store.place, earlier, Run))
+                    self.store.put_run(second, read_record(self.store.place, document, Run))
 
     def choose_documents(self, second: State) -> None:
         """Choose the documents that did not count in the first scan, then old calls and forgotten outputs."""
@@ -235,7 +235,7 @@ class _Removal:
         self.documents.append([name for name in last if name in counting])
 
     def choose_payload(self, second: State, payload: Mapping[str, Sequence[FileEntry]]) -> None:
-        """Choose payload that no document names, also none that does not count and stays."""
+        """Choose the payload that no document names, or only documents that will be removed."""
         going = {name for group in self.documents for name in group}
         records, damaged = read_records(self.store.place, second, going)
         labels = {row.blob: (what, f"{row.run_id}/{row.recipe_id}") for row, what in self.chosen.values()}
@@ -245,13 +245,13 @@ class _Removal:
             if foreign and not is_folder:
                 continue
             label = labels.get(name.split("/")[1], ("payload that no document names", self.store.place.where(name)))
-            why = f"it contains {foreign}, which tcpipe did not write" if foreign else None
-            why = f"{damaged[0]} is damaged and may name it; 'tcpipe verify' lists repairs" if damaged else why
-            if why is None:
+            reason = f"it contains {foreign}, which tcpipe did not write" if foreign else None
+            reason = f"{damaged[0]} is damaged and may name it; 'tcpipe verify' lists repairs" if damaged else reason
+            if reason is None:
                 self.payload.append(name)
                 sizes[label] = sizes.get(label, 0) + size_bytes
             else:
-                self.kept.append(Leftover("payload", self.store.place.where(name), size_bytes, why))
+                self.kept.append(Leftover("payload", self.store.place.where(name), size_bytes, reason))
         self.removed += [Leftover(*label, size_bytes) for label, size_bytes in sizes.items()]
 
     def execute(self) -> None:
@@ -265,8 +265,8 @@ class _Removal:
     def describe(self, waits_for: str | None) -> Pruned:
         """Return the removed parts, or those that would be removed."""
         size_bytes, documents = sum(each.size_bytes for each in self.removed), sum(map(len, self.documents))
-        told = tuple(self.removed), tuple(self.kept), documents, size_bytes
-        return Pruned(str(self.store.root), self.dry_run, *told, waits_for)
+        items = tuple(self.removed), tuple(self.kept), documents, size_bytes
+        return Pruned(str(self.store.root), self.dry_run, *items, waits_for)
 
 
 def _find_temporaries(store: Store) -> list[Leftover]:
@@ -286,7 +286,7 @@ def _describe(row: RunFacts, what: str, why: str) -> Leftover:
 
 
 def _find_old_calls(state: State) -> Iterator[str]:
-    """Yield the keys of ended calls of which many later ones of the same command are known."""
+    """Yield the keys of ended calls before the latest ones of each command."""
     count = Counter[str]()
     for key, call in state.calls:
         if call.exit_code is not None:

@@ -52,10 +52,8 @@ def report(
     A page is only written if its bytes change, and the page of a run is only rendered if its inputs change.
 
     Raises `UsageError`: the path is something else; `StoreError`: something cannot be read; all other pages of a store
-    are written.
-
-    ``recipe`` is the current one: the page of a store sums over its runs. ``runs``: of a store, write the page of every
-    run too.
+    are written. The page of a store adds up the runs of the current ``recipe``. With ``runs``, the pages of all runs of a store are
+    written, too.
     """
     is_there = is_path(path)
     is_one = is_there and is_store(path)

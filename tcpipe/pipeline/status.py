@@ -75,7 +75,7 @@ class Status:
     findings: Mapping[str, int]
     """Number of runs with each warning and error, by code, the worst first."""
     exit_code: int
-    """3 where somebody should look at a log, a run or an output, else 0."""
+    """3 if a log, a run or an output has a problem, else 0."""
 
     def __str__(self) -> str:
         """Return the lines as one text."""
@@ -92,8 +92,8 @@ class Status:
 def find_log_states(options: IngestOptions, *, create: bool = False) -> Status:
     """Return the state that a call of ingest with these options would find; with ``create`` the store need not exist.
 
-    Without logs: those that the latest calls of ingest were given, with the options of these calls. A log that was
-    written more recently than ``min_age_s`` is growing.
+    Without logs, it uses those that the latest calls of ingest were given, and the options of these calls. A log that
+    was written more recently than ``min_age_s`` is growing.
 
     Raises `StoreError`, `UsageError`, `RecipeError`: there is no store, or nothing is known of its sources.
     """
@@ -107,20 +107,20 @@ def find_log_states(options: IngestOptions, *, create: bool = False) -> Status:
     steps = plan_ingestion(tasks, state)
     open_calls, acknowledged = list_open_calls(state), state.acknowledged
     killed = [call for call in open_calls if call.state == "killed"]
-    lately = given or next(iter(asked.values()), ((), CallOptions()))[0]
+    latest_logs = given or next(iter(asked.values()), ((), CallOptions()))[0]
     problems = [
         *state.problems,
         *find_incomplete_runs(state),
         *find_incomplete_maps(state),
         *(call.problem for call in killed),
     ]
-    problems += [make_missing(path, state) for path in missing if path in lately]
+    problems += [make_missing(path, state) for path in missing if path in latest_logs]
     problems += [] if create else find_stale_outputs(opened, state)
     problems = [problem for problem in problems if problem.key not in acknowledged]
     groups = tuple(_iterate_groups(steps))
     current = [run.facts for run in opened.runs(state) if run.facts.ingest_key == ingest_key(ruling)]
-    worse = ((run.run_id, [each for each in run.findings if each.severity != "note"]) for run in current)
-    by_code = group_findings(worse)
+    warnings = ((run.run_id, [each for each in run.findings if each.severity != "note"]) for run in current)
+    by_code = group_findings(warnings)
     return Status(
         store=str(opened.root),
         to_do_now=_describe_first(problems, groups),
@@ -128,7 +128,7 @@ def find_log_states(options: IngestOptions, *, create: bool = False) -> Status:
         counts=dict(sum((Counter({group.state: len(group.logs)}) for group in groups), Counter())),
         groups=groups,
         problems=tuple(problem.finding for problem in problems),
-        gone=tuple(chain(*(lines for path, lines in missing.items() if path not in lately))),
+        gone=tuple(chain(*(lines for path, lines in missing.items() if path not in latest_logs))),
         superseded_runs=sum(bool(row.superseded_by) for row in state.runs.values()),
         open_calls=tuple(call for call in open_calls if call.problem.key not in acknowledged),
         history=tuple(call for _, call in state.calls if call.exit_code is not None)[:_LATEST_CALLS],
@@ -140,7 +140,7 @@ def find_log_states(options: IngestOptions, *, create: bool = False) -> Status:
 
 _LATEST_CALLS = 50
 Asked: TypeAlias = Mapping[str, tuple[tuple[str, ...], CallOptions]]
-"""All inputs and options of the latest call by log or folder that was given to ingest; the latest call first."""
+"""By log or folder: all inputs and options of the last call of ingest with it; the latest call comes first."""
 
 
 def _list_asked(state: State) -> Asked:

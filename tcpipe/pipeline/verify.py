@@ -46,12 +46,9 @@ CheckResult = tuple[str, int] | str | Repair
 
 _COUNTS = {"track": "track_rows", "segments": "segments", "rejections": "rejections"}
 _KNOWN = "dataset, run, store, map (.zarr), model or cost map"
-
 # Kind of a directory, by the document with the checksums of its files.
 _KINDS = dict(zip(CARDS, ("dataset", "model", "cost map"), strict=True))
-
 _HOW_MADE = {"dataset": "build", "model": "train", "cost map": "make"}
-
 _KILLED = "was left by a killed command; 'tcpipe prune' removes it"
 _INGEST = "run {}: copy the store again, or ingest the log again with --force"
 _REPAIRS: Mapping[Kind, str] = {

@@ -131,7 +131,7 @@ class CostGrid:
         return np.asarray(self.reasons & forbidden == 0)
 
     def take(self, cells: Cells) -> dict[str, GenericArray]:
-        """Return all that is known of cells (flat indices, (n,)) by name."""
+        """Return the costs and heights of cells (flat indices, shape (n,)) by name."""
         shapes = {"power_watt": COURSES, "velocity_mps": COURSES, "reasons": COURSES, "height_m": 1}
         return {name: getattr(self, name).reshape(count, -1)[:, cells] for name, count in shapes.items()}
 
@@ -186,8 +186,7 @@ def iterate_blocks(source: MapReader, model: Model, grid: MapGrid, wanted: Mask 
         for i in np.unique(tile_of_row):
             rows = np.flatnonzero(tile_of_row == i)
             for j in range(first, min(first + _STRIP_TILES, int(tile_of_col[-1]) + 1)):
-                cols = np.flatnonzero(tile_of_col == j)
-                cells = (rows[:, None] * grid.cols + cols[None, :]).reshape(-1)
+                cells = (rows[:, None] * grid.cols + np.flatnonzero(tile_of_col == j)[None, :]).reshape(-1)
                 if wanted is not None:
                     cells = cells[wanted.reshape(-1)[cells]]
                 yield from (cells[k : k + CELLS_OF_BLOCK] for k in range(0, cells.size, CELLS_OF_BLOCK))
@@ -245,7 +244,7 @@ class LazyCostGrid:
 
 
 def iterate_row_strips(grid: MapGrid) -> Iterator[tuple[int, int]]:
-    """Yield the first row and the end of each strip of a grid that is in memory at once."""
+    """Yield first and last row (exclusive) of each strip of a grid; one strip is in memory at a time."""
     for first in range(0, grid.rows, _ROWS_TOGETHER):
         yield first, min(first + _ROWS_TOGETHER, grid.rows)
 

@@ -78,9 +78,9 @@ class DriveCost:
     rest_m: Mapping[str, float]
     """Distance of the other segments by reason; a segment may have several [m]."""
     samples_in_training: int
-    """Training samples of this drive: a drive with any is no holdout."""
+    """Number of training samples of this drive; the drive is a holdout if this is 0."""
     near_training_percent: float
-    """Share of its segments with their middle within 1.05 chords of that of a training sample of any drive [%]."""
+    """Share of segments whose middle is within 1.05 chords of the middle of a training sample of any drive [%]."""
     duration_s: IntervalComparison
     energy_joule: IntervalComparison
     label_energy: str

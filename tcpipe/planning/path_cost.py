@@ -145,7 +145,7 @@ def _cut_into_segments(
 
 
 def find_added_turning(model: Model) -> Turning | None:
-    """Return the cost of turns not in a model's predictions; None if turns are an input, or without physics."""
+    """Return the cost of turns if a model's predictions exclude it; None if turns are an input, or without physics."""
     return None if model.takes_turns else find_turning(model.card.physics, model.card.class_table)
 
 
@@ -157,6 +157,7 @@ def _sum_costs(  # noqa: PLR0917
     turn_rad: Floats,
     known: MeasuredRun | None,
 ) -> PathCost:
+    """Return the sums of duration and energy over path segments, with their intervals and the table of segments."""
     class_id, errors, turning = prediction.terrain_class, model.errors, find_added_turning(model)
     nothing = np.full(len(class_id), np.nan)
     duration = segments.arc_m / prediction.velocity_mps
@@ -230,7 +231,7 @@ def _sum_costs(  # noqa: PLR0917
 
 
 def _locate_segments(source: MapReader, segments: PathSegments) -> dict[str, Floats]:
-    """Return columns of the places of path segments."""
+    """Return the columns of the positions of path segments."""
     projection = find_lonlat_projection(source)
     start, end = (projection.inverse(xy_m) for xy_m in (segments.start_xy_m, segments.end_xy_m))
     azimuth_deg, _, _ = Geod(ellps="WGS84").inv(start[:, 0], start[:, 1], end[:, 0], end[:, 1])

@@ -212,13 +212,13 @@ class Turning:
 
 
 def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
-    """Return the cost of turning by a fit, None without such a term; classes without a term have the mean."""
-    found = {} if fit is None else {term.terrain: term.value for term in fit.terms if term.term == "turning"}
-    if fit is None or not found:
+    """Return the cost of turns from a fit; None if the fit has no such term; classes without a term get the mean."""
+    turn_energies = {} if fit is None else {term.terrain: term.value for term in fit.terms if term.term == "turning"}
+    if fit is None or not turn_energies:
         return None
-    joule_per_rad = np.full(_CLASSES, found.get(_ALL, float(np.mean(list(found.values())))))
+    joule_per_rad = np.full(_CLASSES, turn_energies.get(_ALL, float(np.mean(list(turn_energies.values())))))
     for class_id, name in enumerate(classes.names().tolist()):
-        joule_per_rad[class_id] = found.get(name, joule_per_rad[class_id])
+        joule_per_rad[class_id] = turn_energies.get(name, joule_per_rad[class_id])
     return Turning(joule_per_rad, fit.mean_turn_radpm)
 
 
@@ -389,8 +389,7 @@ def straighten_path(steps: GridSteps, points_px: Floats) -> Floats:
     ``points_px`` are the path's points [cells], centres are integers, shape (P, 2).
     """
     angles, metres = np.radians(ANGLES_DEG), steps.length_m / np.hypot(*MOVES.T)
-    limit = np.array(steps.shape[::-1]) - 0.5 - 1e-9
-    points = np.clip(points_px, -0.5, limit)
+    points = np.clip(points_px, -0.5, np.array(steps.shape[::-1]) - 0.5 - 1e-9)
     for _ in range(_PASSES):
         so_far, before = np.empty(len(points)), np.zeros(len(points), np.int64)
         each = max(float(np.linalg.norm(np.diff(points, axis=0), axis=1).mean()), 1.0) * SAMPLES_A_CELL / 2.0

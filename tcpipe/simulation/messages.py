@@ -1,4 +1,4 @@
-"""Readings as the topics a Husky records: ROS 1 as husky_base names them, ROS 2 as clearpath's packages do."""
+"""Measurements as the topics of a Husky: in ROS 1 with the names of husky_base, in ROS 2 of Clearpath's packages."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

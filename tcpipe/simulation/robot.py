@@ -74,7 +74,7 @@ class SimulatedRobot:
     resistance_noise: float = 0.10  # fluctuation of the rolling resistance in time, relative, standard deviation
     resistance_noise_s: float = 0.15  # its correlation time
     ground: dict[int, GroundModel] = field(default_factory=lambda: dict(_GROUND))
-    """By class id; a class that is not named is grass."""
+    """Ground by class id; other classes are grass."""
     wheels: Wheels | None = omit()
     """None: the ground under the robot's middle counts, and bumps and side slopes cost nothing."""
 

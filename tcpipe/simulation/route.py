@@ -30,7 +30,7 @@ class Leg:
     """Drive through waypoints without a stop, from rest to rest."""
 
     waypoints_m: tuple[tuple[float, float], ...]
-    """From the site's south-west corner; the robot's own place is not among them."""
+    """Positions from the site's south-west corner, without the robot's own position."""
     radius_m: float = 2.5  # radius of the curves
     command: float = 1.0  # commanded speed as a fraction of the robot's maximum
 
@@ -104,7 +104,7 @@ def make_leg_path(start_m: Floats, leg: Leg, *, weave: tuple[Floats, Floats, Flo
 
 
 def make_straight_path(start_m: Floats, direction_rad: float, distance_m: float) -> Path:
-    """Return a straight path that should be stopped on after ``distance_m``."""
+    """Return a straight path on which the robot should stop after ``distance_m``."""
     s = np.linspace(0.0, distance_m + _RUN_OUT_M, 8)
     points = start_m + s[:, None] * np.array([np.cos(direction_rad), np.sin(direction_rad)])
     return Path(CubicSpline(s, points), float(s[-1]), distance_m)
@@ -144,7 +144,7 @@ def compute_moving_average(values: Floats, window_m: float) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class AlongRoad:
-    """To and fro along a road, each time on another line of it."""
+    """Drives back and forth on a road, each time along another line."""
 
     road: Band
     from_m: float  # along the road's axis, from its (x, y)
@@ -157,7 +157,7 @@ class AlongRoad:
 
     @property
     def start_m(self) -> tuple[float, float]:
-        """Where it begins, from the site's south-west corner."""
+        """Start, from the site's south-west corner."""
         return self._place(self.from_m, 0.0)
 
     def plan(self, world: World, rng: np.random.Generator) -> list[Manoeuvre]:  # noqa: ARG002  as other tours
@@ -194,7 +194,7 @@ class Wander:
     shares: tuple[tuple[int, float], ...] = ((4, 0.51), (5, 0.09), (6, 0.20), (7, 0.20))
     """Wanted share of the distance by class id (the paper's by default)."""
     x_range_m: tuple[float, float] | None = None
-    """Kept between these, from the site's west border; None: the whole site."""
+    """Limits of the tour, from the site's west border; None: the whole site."""
     margin_m: float = 5.0  # kept from the site's border
     max_slope_deg: float = 22.5  # steeper ground is avoided
     climbing: float = 0.3  # how much steep ground draws it, against wanted classes
@@ -310,6 +310,7 @@ def _plan_stretches(
     world: World, manoeuvre: Manoeuvre, place: Floats, yaw: float, *,
     robot: SimulatedRobot, weave_m: float, rng: np.random.Generator,
 ) -> list[_Stretch]:  # fmt: skip
+    """Return the driven sections of a manoeuvre that begins at a position and yaw."""
     match manoeuvre:
         case Pause(duration_s):
             return [_make_halt(place, yaw, duration_s)]
@@ -394,6 +395,7 @@ def _drive_path(world: World, path: Path, command: float, robot: SimulatedRobot,
 def _make_truth(
     world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int, rng: np.random.Generator
 ) -> Truth:
+    """Return the truth of driven sections: poses, velocities, power and slip."""
     site = world.site
     x, y = driven.uv_m[:, 0] + site.west_m, driven.uv_m[:, 1] + site.south_m
     alt = world.height_m(x, y) + site.geoid_m

@@ -63,7 +63,7 @@ class DriveSpec:
 
 @dataclass(frozen=True, slots=True)
 class RasterSpec:
-    """How the world is cut into rasters: pitch and shift of each, so that no two share a grid."""
+    """Pixel size and shift of each raster of the world; no two rasters share a grid."""
 
     height_pitch_m: float = 0.05
     ortho_pitch_m: float = 0.06

@@ -21,7 +21,7 @@ from tcpipe.simulation.truth import Truth
 from tcpipe.simulation.world import Site
 
 CLOCK_STEP_NS = 2_500_000_000
-"""How far header stamps jump with the fault ``clock_step``."""
+"""Size of the jump of header stamps with the fault ``clock_step``."""
 
 Triple = tuple[float, float, float]
 Values = dict[str, Any]
@@ -63,12 +63,12 @@ class Faults:
 
     @classmethod
     def every(cls) -> Faults:
-        """Return all of them switched on but those of the clocks, after which stamps are not the truth's any more."""
+        """Return all faults switched on, except those of clocks, with which stamps differ from the truth."""
         return cls(**{field.name: "clock" not in field.name for field in fields(cls)})
 
     @classmethod
     def only(cls, *names: str) -> Faults:
-        """Return those named switched on, all others off."""
+        """Return the named faults switched on, all others off."""
         return cls(**dict.fromkeys(names, True))
 
 
@@ -106,7 +106,7 @@ class Gnss:
     covariance: Literal["known", "unknown"] = "known"  # whether the message states its standard deviation
     mounting: Mounting = Mounting((0.1, 0.0, 0.9))
     stated_off_m: float = 0.05
-    """By at most how much the log states another place than that, in a direction that each drive draws."""
+    """Largest error of the position that the log states; each drive draws its direction."""
     outlier_share: float = 0.01
     outlier_m: float = 1.5
     outage_s: float = 10.0
@@ -116,7 +116,7 @@ class Gnss:
 
 
 EXACT_GNSS = Gnss(std_m=0.015, vertical_std_m=0.025, lasting_std_m=(0.0, 0.0), stated_off_m=0.0)
-"""White noise, and an antenna where the log states it: kinder than real receivers."""
+"""White noise, and an antenna at the position that the log states: better than real receivers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +188,7 @@ class Power:
     rate_hz: float = 20.0
     averaged: bool = False  # over the period that ends at the stamp, rather than sampled at it
     reading_hz: float | None = None
-    """How often the device is read, where each message repeats the last reading; None: for every message."""
+    """Rate at which the device is read; messages repeat its last value; None: it is read for every message."""
     voltage_std_volt: float = 0.02
     current_std_amp: float = 0.08
     voltage_step_volt: float = 0.01
@@ -227,7 +227,7 @@ class Sensors:
         return replace(self, **{name: replace(getattr(self, name), mounting=Mounting()) for name in names})
 
     def stated(self, faults: Faults, noise: Noise) -> Sensors:
-        """Return the sensors with the extrinsics in the log: those of the antenna err by up to ``stated_off_m``."""
+        """Return the sensors with the extrinsics in the log; the antenna's are wrong by up to ``stated_off_m``."""
         if self.gnss is None or not faults.gnss_lever_arm:
             return self
         rng, mounting = noise("gnss.stated"), self.gnss.mounting
@@ -312,7 +312,7 @@ def _make_lasting_noise(count: int, step: float, rng: np.random.Generator) -> Fl
 
 
 def read_doppler(truth: Truth, sensor: Doppler, faults: Faults, noise: Noise) -> Reading:
-    """Return velocity_enu_mps of the antenna, (N, 3), and what the receiver claims of it, covariance (N, 36)."""
+    """Return the antenna's velocity in ENU [m/s], shape (N, 3), and the covariance that the receiver states, (N, 36)."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("gnss.phase"))
     place = truth.enu_m + rotate(truth.quat_xyzw, np.array(sensor.mounting.xyz_m))
     velocity = _interpolate(np.gradient(place, truth.stamp_ns * 1e-9, axis=0), truth, stamp)

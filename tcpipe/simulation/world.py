@@ -151,7 +151,7 @@ def evaluate_field(waves: Sequence[Wave], u: Floats, v: Floats) -> Floats:
 
 
 def state(waves: Sequence[Wave], u: Floats, v: Floats) -> Floats:
-    """Return a field that is spread evenly over -1 … 1, of waves whose squares sum to 1."""
+    """Return a field with uniformly distributed values from -1 to 1, from waves whose squares sum to 1."""
     return np.asarray(erf(evaluate_field(waves, u, v) / np.sqrt(2.0)))
 
 
@@ -189,7 +189,7 @@ class Surface:
         return (1.0 - self._by_class("wet_shade")[classes] * state(self.wetness, u, v)) * (1.0 + grain)
 
     def resistance(self, classes: Bytes, u: Floats, v: Floats) -> Floats:
-        """Return the rolling resistance that is added, as a fraction of the class's."""
+        """Return the added rolling resistance, as a fraction of that of the class."""
         wet = self._by_class("wet_resistance")[classes] * state(self.wetness, u, v)
         return wet + self._by_class("cover_resistance")[classes] * state(self.cover, u, v)
 
