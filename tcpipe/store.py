@@ -132,7 +132,7 @@ def counts(row: RunFacts, state: State) -> bool:
 
 
 def name_run(state: State, stem: str, sha256: str) -> str:
-    """Return the name of the run of a content: its own, or a new one unlike those of other logs of the same name."""
+    """Return the name of the run of a content: its existing one, or a new one that no run of the store has."""
     if known := min((row.run_id for row in state.runs.values() if row.log.sha256 == sha256), default=None):
         return known
     taken = {row.run_id for row in state.runs.values()}

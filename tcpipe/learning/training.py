@@ -61,7 +61,7 @@ class TrainResult:
     samples: Mapping[str, int]
     """Number of samples: fitted, and held out for early stopping."""
     epochs: int
-    """Largest and best number of epochs, or of trees for each label."""
+    """Number of epochs, or of trees for each label; ``best_epoch`` of them give the model."""
     best_epoch: int
     held_out_loss: float
     device: str

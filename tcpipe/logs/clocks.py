@@ -222,7 +222,7 @@ def select_times(times: TopicTimes, rows: Ints) -> TopicTimes:
 
 
 def _settle_steps(topics: Mapping[str, TopicTimes], of_host: Sequence[ClockStep]) -> AlignedClocks:
-    """Return each topic's timeline, and the steps of single clocks beside those of the host's."""
+    """Return each topic's timeline, and the steps of the host's clock and of single clocks."""
     steps_of = {name: _find_steps(times) for name, times in topics.items()}
     reasons = {name: _find_header_problem(times, steps_of[name]) for name, times in topics.items()}
     # An unused header is also not used to judge the clock of the others.

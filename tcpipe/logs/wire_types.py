@@ -194,7 +194,7 @@ class Grid:
     strides: tuple[int, ...]
 
     def view(self, data: Bytes, dtype: np.dtype[np.generic], count: int = 1) -> GenericArray:
-        """Return a copy of the values there, ``count`` side by side at each place, in the order of `list_offsets`."""
+        """Return a copy of ``count`` successive values from each offset, in the order of `list_offsets`."""
         together = dtype if count == 1 else np.dtype(f"V{count * dtype.itemsize}")  # one large copy is faster
         if not count:
             return np.zeros(0, dtype)

@@ -211,7 +211,7 @@ def describe_layer(layer: Layer) -> Description:
 
 
 def read_layers(found: Mapping[str, Description], classes: Sequence[TerrainClass], path: Path) -> dict[str, Layer]:
-    """Return the layers that `describe_layer` wrote to ``path``, by name; ``classes`` are those of terrain, if any."""
+    """Return the layers that `describe_layer` wrote to ``path``, by name; ``classes`` are the terrain classes, if any."""
     layers: dict[str, Layer] = {}
     for name, description in found.items():
         about = parse_typed(description, _LayerDescription, path)

@@ -215,7 +215,7 @@ def compute_mean_idle_power(samples: pa.Table) -> float | None:
 
 
 def count_flagged(quality: pa.ChunkedArray) -> FlaggedSamples:
-    """Return the count of samples with a quality bit that not all have, and counts by bit."""
+    """Return the number of samples with a quality bit that some samples lack, and the number of samples by bit."""
     bits = quality.to_numpy().astype(np.int64)
     counts = {flag_name(bit): int(np.count_nonzero(bits & int(bit))) for bit in Quality}
     common = int(np.bitwise_and.reduce(bits)) if len(bits) > 1 else 0
