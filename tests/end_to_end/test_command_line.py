@@ -111,7 +111,7 @@ def _written(directory: Path) -> dict[Path, int]:
         (["export", "LOG", "out", "--topics", "/nosuch"], "topic /nosuch is not in this log", 1),
         (["export", "LOG", "LOG/below"], "is a file, expected a directory", 2),
         (["simulate", "out", "--scenario", "nosuch"], "scenario 'nosuch' is unknown", 2),
-        (["simulate", ".."], "is not this simulated site", 2),
+        (["simulate", ".."], "is no site of scenario demo", 2),
         (["add-map", "m", "--height", "LOG"], "not a raster", 1),
     ],
 )
