@@ -12,7 +12,7 @@ from tcpipe.formats.runs import LogOrigin
 from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation.scenarios import find_scenario
 from tcpipe.simulation.site_files import write_rasters
-from tcpipe.store import Store, open_store
+from tcpipe.store import Store, choose_maps, open_store
 from tcpipe.tables.columns import make_lines, to_floats
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 
@@ -38,13 +38,18 @@ def store_of(directory: Path, samples: int) -> Store:
     store = Store(directory / f"store-{samples}")
     if not Path(store.root).exists():
         open_store(store.root, create=True)
-        found = Store(maps)
         with store.new_map("site") as (path, put):
-            shutil.copytree(found.map_at(found.find_map("site"))[0], path)
+            shutil.copytree(find_site(Store(maps)), path)
             put(store.scan())
         for number in range(-(-samples // RUN_ROWS)):
             _add_run(store, number, min(RUN_ROWS, samples - number * RUN_ROWS))
     return store
+
+
+def find_site(store: Store) -> Path:
+    """Return where the map of the site is."""
+    (site,) = choose_maps(store, store.scan(), ["site"])
+    return store.map_at(site)[0]
 
 
 def meander(bounds_m: tuple[float, float, float, float], count: int, *, seed: int) -> np.ndarray:
@@ -66,7 +71,7 @@ def meander(bounds_m: tuple[float, float, float, float], count: int, *, seed: in
 
 
 def _add_run(store: Store, number: int, rows: int) -> None:
-    grid = open_map(store.map_at(store.find_map("site"))[0]).grid
+    grid = open_map(find_site(store)).grid
     points = meander(grid.bounds_m, rows, seed=number)
     lon, lat = Transformer.from_crs(grid.crs, 4326, always_xy=True).transform(*points.T)
     azimuth_deg, _, chord_m = Geod(ellps="WGS84").inv(lon[:-1], lat[:-1], lon[1:], lat[1:])

@@ -21,7 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from big_store import SMALL, store_of
+from big_store import SMALL, find_site, store_of
 from sample_patches import gather
 
 from tcpipe.formats.dataset_files import CHUNK_ROWS, open_patches, read_card
@@ -151,7 +151,7 @@ def built(store, out):
 
 def floors_of(store, out, result, decoded):
     """Seconds that decoding, gathering and encoding take at least."""
-    path, count = store.map_at(store.find_map("site"))[0], result.card.samples
+    path, count = find_site(store), result.card.samples
     few = min(count, 50_000)
     return {
         "decode": decode_floor(path, decoded),

@@ -234,7 +234,10 @@ def test_a_model_says_which_layers_it_takes(datasets, tmp_path, caplog):
         "does not use canopy, east, moisture, north; to use it: --layers ortho,terrain,height,canopy,east"
         in caplog.text
     )
-    for layers, model, line in (("ortho,soil", "boosting", "requested channels: soil"), (PAPER, "physics", "not a patch")):
+    for layers, model, line in (
+        ("ortho,soil", "boosting", "requested channels: soil"),
+        (PAPER, "physics", "not a patch"),
+    ):
         more = ["--model", model, "--layers", layers]
         result = CliRunner().invoke(cli, ["train", str(datasets / "zarr"), str(tmp_path / "other"), *more])
         assert isinstance(result.exception, TcpipeError)
