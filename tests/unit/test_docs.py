@@ -77,9 +77,8 @@ def test_the_changelog_of_versions_before_2_has_at_most_60_lines() -> None:
 
 
 def test_changelog_and_citation_are_of_this_version() -> None:
-    changelog, citation = ((ROOT / name).read_text(encoding="utf-8") for name in ("CHANGELOG.md", "CITATION.cff"))
-    assert re.findall("^## (.*)", changelog, re.MULTILINE)[0] == __version__
-    assert re.findall("^version: (.*)", citation, re.MULTILINE) == [__version__]
+    texts = ((ROOT / name).read_text(encoding="utf-8") for name in ("CHANGELOG.md", "CITATION.cff"))
+    assert [re.findall("^(?:##|version:) (.*)", text, re.MULTILINE)[0] for text in texts] == [__version__] * 2
 
 
 def test_every_decision_stands_once_in_the_index() -> None:
