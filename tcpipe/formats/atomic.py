@@ -40,7 +40,7 @@ _BEFORE = ".before"
 # Errors that only writing can cause, for any file name.
 _UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}
 
-_LAST_WRITE_S = 0.05  # where writing is broken off by a signal, a thread of zarr still finishes the small file it is at
+_LAST_WRITE_S = 0.05  # after a signal, a thread of zarr may need this long to finish its current file [s]
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2

@@ -273,7 +273,7 @@ _DIGGING_RESISTANCE = 0.3  # rolling resistance of wheels that turn while the ro
 
 
 @dataclass(frozen=True, slots=True)
-class _Stretch:
+class _DrivePart:
     """One manoeuvre, sampled: position from the map corner and direction in the map, wheel speed, slip, commands."""
 
     uv_m: Floats
@@ -292,24 +292,24 @@ def simulate_drive(
 
     The robot begins along the map's x axis; ``weave_m`` is how far the human weaves to the side.
     """
-    stretches: list[_Stretch] = []
+    parts: list[_DrivePart] = []
     place, yaw = np.array(start_m, dtype=float), 0.0
     for manoeuvre in plan:
-        for stretch in _plan_stretches(world, manoeuvre, place, yaw, robot=robot, weave_m=weave_m, rng=rng):
-            stretches.append(stretch)
-            place, yaw = stretch.uv_m[-1], float(stretch.yaw_map_rad[-1])
-    if not stretches:
+        for part in _plan_parts(world, manoeuvre, place, yaw, robot=robot, weave_m=weave_m, rng=rng):
+            parts.append(part)
+            place, yaw = part.uv_m[-1], float(part.yaw_map_rad[-1])
+    if not parts:
         raise UsageError("simulated drive: the plan is empty; give it at least one manoeuvre")
-    joined = _Stretch(
-        *(np.concatenate([getattr(stretch, name) for stretch in stretches]) for name in _Stretch.__dataclass_fields__)
+    joined = _DrivePart(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in _DrivePart.__dataclass_fields__)
     )
     return _make_truth(world, joined, robot, start_ns, rng)
 
 
-def _plan_stretches(
+def _plan_parts(
     world: World, manoeuvre: Manoeuvre, place: Floats, yaw: float, *,
     robot: SimulatedRobot, weave_m: float, rng: np.random.Generator,
-) -> list[_Stretch]:  # fmt: skip
+) -> list[_DrivePart]:  # fmt: skip
     """Return the driven sections of a manoeuvre that begins at a position and yaw."""
     match manoeuvre:
         case Pause(duration_s):
@@ -335,15 +335,15 @@ def _plan_stretches(
 
 def _make_halt(
     place: Floats, yaw: float, duration_s: float, *, wheel_mps: float = 0.0, command_mps: float = 0.0
-) -> _Stretch:
+) -> _DrivePart:
     count = max(round(duration_s / _DT_S), 1)
     t = np.arange(count) * _DT_S
     wheel = wheel_mps * np.clip(np.minimum(t, t[-1] - t) / 0.4, 0.0, 1.0)
     slip, zero = np.full(count, 1.0 if wheel_mps else 0.0), np.zeros(count)
-    return _Stretch(np.tile(place, (count, 1)), np.full(count, yaw), wheel, slip, np.full(count, command_mps), zero)
+    return _DrivePart(np.tile(place, (count, 1)), np.full(count, yaw), wheel, slip, np.full(count, command_mps), zero)
 
 
-def _turn(place: Floats, yaw: float, angle_rad: float, robot: SimulatedRobot) -> _Stretch:
+def _turn(place: Floats, yaw: float, angle_rad: float, robot: SimulatedRobot) -> _DrivePart:
     """Turn with a trapezoid of yaw rate that ends exactly at the angle."""
     rate, rise_s = robot.max_yaw_rate_radps, 0.35
     size = abs(angle_rad)
@@ -353,10 +353,10 @@ def _turn(place: Floats, yaw: float, angle_rad: float, robot: SimulatedRobot) ->
     swept = accumulate(shape[1:] + shape[:-1])
     zero = np.zeros(t.size)
     command = np.where(t < hold_s + rise_s, np.sign(angle_rad) * min(rate, size / rise_s), 0.0)
-    return _Stretch(np.tile(place, (t.size, 1)), yaw + angle_rad * swept / swept[-1], zero, zero, zero, command)
+    return _DrivePart(np.tile(place, (t.size, 1)), yaw + angle_rad * swept / swept[-1], zero, zero, zero, command)
 
 
-def _drive_path(world: World, path: Path, command: float, robot: SimulatedRobot, *, backwards: bool) -> _Stretch:
+def _drive_path(world: World, path: Path, command: float, robot: SimulatedRobot, *, backwards: bool) -> _DrivePart:
     """Drive a path from rest to rest."""
     grid = np.arange(0.0, path.length_m, PATH_GRID_M)
     uv, direction = path.at(grid)
@@ -389,11 +389,11 @@ def _drive_path(world: World, path: Path, command: float, robot: SimulatedRobot,
     braking = s >= brake_at_m
     commanded = np.where(braking, 0.0, sign * command_mps)
     commanded_rate = np.where(braking, 0.0, np.gradient(yaw, _DT_S)) if s.size > 1 else np.zeros(1)
-    return _Stretch(uv, yaw, sign * wheel, np.interp(s, grid, slip), commanded, commanded_rate)
+    return _DrivePart(uv, yaw, sign * wheel, np.interp(s, grid, slip), commanded, commanded_rate)
 
 
 def _make_truth(
-    world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int, rng: np.random.Generator
+    world: World, driven: _DrivePart, robot: SimulatedRobot, start_ns: int, rng: np.random.Generator
 ) -> Truth:
     """Return the truth of driven sections: poses, velocities, power and slip."""
     site = world.site
@@ -447,7 +447,7 @@ def _compute_angular_velocity(quat_xyzw: Floats) -> Floats:
 
 
 def _compute_power(
-    robot: SimulatedRobot, driven: _Stretch, slope: Floats, rolling: Floats, rng: np.random.Generator
+    robot: SimulatedRobot, driven: _DrivePart, slope: Floats, rolling: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats, Floats]:
     """Return voltage, propulsion current, and the right driver's share of it."""
     rolling = np.where(driven.slip == 1.0, _DIGGING_RESISTANCE, rolling)

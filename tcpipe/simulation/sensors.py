@@ -400,7 +400,7 @@ def read_visual(truth: Truth, sensor: Visual, faults: Faults, noise: Noise) -> R
         hit = rng.random(stamp.size) < sensor.outlier_share
         wrong = wrong + hit[:, None] * sensor.outlier_mps * rng.standard_normal(linear.shape)
     linear = linear + wrong
-    keep = _remove_stretch(stamp, truth, noise("visual.dropouts"), sensor.dropout_s) if faults.visual_dropouts else None
+    keep = _remove_span(stamp, truth, noise("visual.dropouts"), sensor.dropout_s) if faults.visual_dropouts else None
     position, orientation = _make_camera_pose(at, sensor, faults, wrong, noise)
     values: Values = {"linear_mps": linear, "angular_radps": angular}
     values |= {"position_m": position, "orientation_xyzw": orientation}
@@ -428,7 +428,7 @@ def read_power_meters(truth: Truth, sensor: Power, faults: Faults, noise: Noise)
         last = np.maximum(np.searchsorted(read_ns, stamp, side="right") - 1, 0)
         values = {name: reading[last] for name, reading in values.items()}
     values["electronics_amp"] = sensor.electronics_watt / values["voltage_volt"]
-    keep = _remove_stretch(stamp, truth, noise("power.gap"), sensor.gap_s) if faults.power_gap else None
+    keep = _remove_span(stamp, truth, noise("power.gap"), sensor.gap_s) if faults.power_gap else None
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="power", keep=keep)
 
 
@@ -473,7 +473,7 @@ def _draw_begin_ns(truth: Truth, rng: np.random.Generator, length_s: float) -> i
     return int(truth.stamp_ns[0] + rng.uniform(0.25, 0.75) * max(span - length_s * 1e9, 0.0))
 
 
-def _remove_stretch(stamp: Ints, truth: Truth, rng: np.random.Generator, length_s: float) -> Mask:
+def _remove_span(stamp: Ints, truth: Truth, rng: np.random.Generator, length_s: float) -> Mask:
     """Return the remaining messages if a span of this length is missing."""
     begin = _draw_begin_ns(truth, rng, length_s)
     return (stamp < begin) | (stamp >= begin + round(length_s * 1e9))

@@ -57,7 +57,7 @@ class Quality(IntFlag):
     """The voltage leaves the range of the robot profile."""
     CLOCK_DOUBTFUL = 1 << 8
     """A clock of the run stepped, two clocks differ, or log time replaces the stamps."""
-    # 1 << 9 stays unassigned: it was `physics_outlier` until 1.0.0.
+    # 1 << 9 is unassigned.
     BELOW_FULL_SPEED = 1 << 10
     """Commanded on average below `full_speed_fraction` of the robot's maximum: the terrain does not limit the speed."""
     SENSORS_DISAGREE = 1 << 11

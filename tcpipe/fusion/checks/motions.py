@@ -178,8 +178,8 @@ def dead_reckon(twist: Floats) -> Plane:
 
 # Lags between signals
 
-MAX_LAG_S = 1.2  # largest lag of the fine search [s]
-_STEPS = round(MAX_LAG_S / GRID_S)
+_FINE_RANGE_S = 1.2  # largest lag of the fine search [s]
+_STEPS = round(_FINE_RANGE_S / GRID_S)
 _GROUPS, _MIN_GROUPS, _MIN_GROUP_S = 20, 4, 2.0
 """Largest and smallest number of groups of the jackknife [1], and least length of a group [s]."""
 _INDEPENDENT = 10
@@ -286,7 +286,7 @@ def _has_rival(explained_share: Floats, best: int, independent: float) -> bool:
 # Clocks that are seconds to minutes apart
 
 _COARSE_S = 0.2  # spacing of the rows of the coarse search [s]
-NEAR_S = MAX_LAG_S - _COARSE_S  # largest lag that the fine search finds reliably [s]
+NEAR_S = _FINE_RANGE_S - _COARSE_S  # largest lag that the fine search finds reliably [s]
 
 
 def prepare_coarse_signals(speed_mps: Floats, turn_radps: Floats) -> Floats:

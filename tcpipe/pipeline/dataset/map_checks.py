@@ -181,7 +181,7 @@ def _make_map_registration(run_id: str, found: Registration, expected_m: float, 
 _CONTRADICTION = "map-contradicts-track"
 _LIMITS = ("min_slope_rad", "min_slope_rad", "min_rise_m", "min_bulge_m")
 _ATTITUDE_ROLES = {"imu", "visual_odometry", "pose"}
-_MIN_HEIGHT_CHANGE_M = 0.001  # A track whose heights change by less has no measured heights
+_MIN_HEIGHT_CHANGE_M = 0.001  # least range of heights on a track that measures them [m]
 _MOTION = ("start_z_m", "end_z_m", "chord_m", "pitch_rad", "roll_rad", "fused_velocity_mps")
 _Rows = Floats
 

@@ -41,15 +41,15 @@ class BuildOptions:
 
 def read_build_options(options: BuildDatasetOptions, recipe: Recipe) -> BuildOptions:
     """Return a user's choices for a dataset, read and checked."""
-    split, map_name = options.split, options.map
-    if options.without_patches and map_name:
+    split, given_map = options.split, options.map
+    if options.without_patches and given_map:
         raise UsageError("--map, --without-patches: samples without patches need no map; remove one of them")
     tables = [options.covariates] if isinstance(options.covariates, str | Path) else options.covariates
     return BuildOptions(
         recipe=recipe,
         robot=options.robot or recipe.robot,
         tags=options.tag or {},
-        map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
+        map_names=(given_map,) if isinstance(given_map, str) else tuple(given_map or ()),
         labels=parse_labels(options.labels),
         without_patches=options.without_patches,
         regions=None if split is None else read_regions(Path(split)),
